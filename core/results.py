@@ -1,0 +1,68 @@
+"""The one JSON shape for everything measured."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+REPORTED_PACKAGES = ("numpy", "onnxruntime", "torch", "scipy", "scikit-image", "open3d-cpu", "trimesh")
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that are installed, without importing them."""
+    found = {"python": platform.python_version()}
+    for name in REPORTED_PACKAGES:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def commit() -> str:
+    """The checkout's commit, ``-dirty`` appended if tracked files differ; ``unknown`` outside a checkout."""
+    folder = Path(__file__).resolve().parent
+    try:
+        text = subprocess.run(
+            ["git", "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"],
+            cwd=folder, capture_output=True, text=True, timeout=10, check=True,
+        ).stdout.strip()  # fmt: skip
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
+    return text or "unknown"
+
+
+def machine() -> dict[str, Any]:
+    """Processor architecture and cores; nothing that names the host."""
+    return {"architecture": platform.machine(), "system": platform.system(), "cores": os.cpu_count()}
+
+
+def build_results(
+    rows: Sequence[Mapping[str, Any]], *, command: str | None = None, seeds: Sequence[int] = (), **extra: Any
+) -> dict[str, Any]:
+    """Assemble the results object; every row must have a ``method``."""
+    for row in rows:
+        if "method" not in row:
+            raise ValueError(f"build_results: every row needs a 'method', got keys {sorted(row)}")
+    if command is None:
+        command = " ".join(["python", Path(sys.argv[0]).name, *sys.argv[1:]])
+    return {
+        "command": command, "commit": commit(), "versions": versions(), "machine": machine(),
+        "seeds": list(seeds), **extra, "rows": [dict(row) for row in rows],
+    }  # fmt: skip
+
+
+def write_results(path: str | Path, results: Mapping[str, Any]) -> None:
+    """Write atomically: a reader sees the old file or the whole new one."""
+    target = Path(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    partial = target.with_name(target.name + ".partial")
+    partial.write_text(json.dumps(results, indent=1, sort_keys=False, allow_nan=False) + "\n", encoding="utf-8")
+    os.replace(partial, target)

@@ -1,0 +1,1 @@
+"""Cube recipes: procedural and mesh cubes, corruptions, harvested pairs."""

@@ -1,0 +1,1 @@
+"""The two-trajectory protocol: captures, masks, metrics."""

@@ -1,0 +1,1 @@
+"""Cube proposals, DSDS, visibility and clean(): everything applied to a density callable."""
