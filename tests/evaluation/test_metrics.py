@@ -1,0 +1,213 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from skimage.metrics import structural_similarity
+
+from unghost.core.cameras import Cameras
+from unghost.evaluation import metrics
+
+FULL = np.ones((24, 30), dtype=bool)
+
+
+def _pair(seed=0, shape=(24, 30, 3)):
+    rng = np.random.default_rng(seed)
+    target = rng.random(shape)
+    return np.clip(target + rng.normal(scale=0.1, size=shape), 0, 1), target
+
+
+def _camera(width=30, height=24, pose=None):
+    pose = np.eye(4)[None] if pose is None else pose
+    return Cameras.create(pose, np.array([25.0, 25.0, width / 2, height / 2]), width, height)
+
+
+def test_psnr_known_value():
+    # an error of .1 everywhere: MSE .01, 10 log10(1 / .01) = 20 dB; 10 log10(4 / .01) = 26.0206 dB
+    target = np.full((4, 5, 3), 0.5)
+    mask = np.ones((4, 5), dtype=bool)
+    assert metrics.psnr(target + 0.1, target, mask, data_range=1.0) == pytest.approx(20)
+    assert metrics.psnr(target + 0.1, target, mask, data_range=2.0) == pytest.approx(26.0206, abs=1e-4)
+    assert metrics.psnr(target, target, mask, data_range=1.0) == float("inf")
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10**6), st.integers(0, 20), st.integers(1, 23), st.integers(0, 20), st.integers(1, 29))
+def test_masked_metrics_equal_those_of_the_cropped_region(seed, top, bottom, left, right):
+    top, bottom = min(top, bottom), max(top, bottom) + 1
+    left, right = min(left, right), max(left, right) + 1
+    preds, target = _pair(seed)
+    mask = np.zeros((24, 30), dtype=bool)
+    mask[top:bottom, left:right] = True
+    crop = np.s_[top:bottom, left:right]
+    whole = mask[crop]
+    assert metrics.psnr(preds, target, mask, data_range=1.0) == pytest.approx(
+        metrics.psnr(preds[crop], target[crop], whole, data_range=1.0)
+    )
+    first, second = preds[..., 0] + 1, target[..., 0] + 1
+    for metric in (metrics.depth_mse, metrics.disparity_mae):
+        assert metric(first, second, mask) == pytest.approx(metric(first[crop], second[crop], whole))
+
+
+def test_what_is_masked_out_is_never_looked_at():
+    preds, target = _pair()
+    mask = FULL.copy()
+    mask[3, 4] = False
+    wanted = metrics.psnr(preds, target, mask, data_range=1.0)
+    spoilt = preds.copy()
+    spoilt[3, 4] = np.nan
+    assert metrics.psnr(spoilt, target, mask, data_range=1.0) == wanted
+    depth = preds[..., 0] + 1
+    wanted = metrics.depth_mse(depth, target[..., 0] + 1, mask)
+    depth[3, 4] = np.inf
+    assert metrics.depth_mse(depth, target[..., 0] + 1, mask) == wanted
+    with pytest.raises(ValueError, match="3 unmasked values are NaN"):
+        metrics.psnr(spoilt, target, FULL, data_range=1.0)
+
+
+@pytest.mark.parametrize("data_range", [1.0, 255.0])
+def test_ssim_map_is_scikit_images(data_range):
+    preds, target = (image * data_range for image in _pair())
+    _, oracle = structural_similarity(
+        preds, target, gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
+        data_range=data_range, channel_axis=-1, full=True,
+    )  # fmt: skip
+    np.testing.assert_allclose(metrics.ssim_map(preds, target, data_range=data_range), oracle.mean(axis=-1), atol=1e-10)
+    assert metrics.ssim(preds, target, FULL, data_range=data_range) == pytest.approx(oracle.mean())
+
+
+def test_ssim_of_a_crop_is_the_masked_one_where_no_window_leaves_the_crop():
+    preds, target = _pair()
+    whole = metrics.ssim_map(preds, target, data_range=1.0)
+    crop = metrics.ssim_map(preds[2:22, 3:27], target[2:22, 3:27], data_range=1.0)
+    np.testing.assert_allclose(crop[5:-5, 5:-5], whole[7:17, 8:22], atol=1e-12)
+    mask = np.zeros_like(FULL)
+    mask[7:17, 8:22] = True
+    assert metrics.ssim(preds, target, mask, data_range=1.0) == pytest.approx(crop[5:-5, 5:-5].mean())
+
+
+def test_ssim_conventions_differ_as_documented():
+    preds, target = _pair()
+    mask = np.zeros_like(FULL)
+    mask[:, :6] = True
+    fair = metrics.ssim(preds, target, mask, data_range=1.0)
+    leaky = metrics.ssim(preds, target, mask, data_range=1.0, convention="premasked")
+    assert leaky > fair + 0.03  # holes agree perfectly
+    assert metrics.ssim(preds, target, FULL, data_range=1.0, convention="premasked") == pytest.approx(
+        metrics.ssim(preds, target, FULL, data_range=1.0)
+    )
+    # behind the mask, map_mean sees its neighbours' pixels and premasked does not
+    other = preds.copy()
+    other[:, 15:] = 0.3
+    assert metrics.ssim(other, target, mask, data_range=1.0) == pytest.approx(fair)  # 9 columns away: out of reach
+    other[:, 6:] = 0.3
+    assert metrics.ssim(other, target, mask, data_range=1.0) != pytest.approx(fair)
+    assert metrics.ssim(other, target, mask, data_range=1.0, convention="premasked") == pytest.approx(leaky)
+
+
+def test_depth_and_disparity_known_values():
+    preds = np.array([[1.0, 2.0], [4.0, np.inf]])
+    target = np.array([[2.0, 2.0], [1.0, np.inf]])
+    mask = np.array([[True, True], [True, False]])
+    assert metrics.depth_mse(preds, target, mask) == pytest.approx((1 + 0 + 9) / 3)
+    assert metrics.disparity_mae(preds, target, mask) == pytest.approx((0.5 + 0 + 0.75) / 3)
+    assert metrics.disparity_mae(preds, target, np.ones((2, 2), dtype=bool)) == pytest.approx(1.25 / 4)
+    with pytest.raises(ValueError, match="must be > 0"):
+        metrics.disparity_mae(preds - 1, target, mask)
+
+
+def test_backprojection_lands_on_the_plane_it_came_from():
+    camera = _camera()
+    _, directions = camera.rays(0)
+    depth = 3.0 / -directions[..., 2]  # the plane z = -3, as distance along unit rays
+    positions = metrics.backproject(depth, camera, 0)
+    np.testing.assert_allclose(positions[..., 2], -3.0, atol=1e-12)
+    depth[2, 3] = np.inf
+    assert np.isnan(metrics.backproject(depth, camera, 0)[2, 3]).all()
+
+
+@pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.3, -0.4, 0.8), (-0.6, 0.1, 0.5)])
+def test_normals_of_a_tilted_plane_are_exact_and_face_the_camera(normal):
+    unit = np.array(normal) / np.linalg.norm(normal)
+    camera = _camera()
+    _, directions = camera.rays(0)
+    depth = -2.0 / (directions @ unit)  # unit . (d t) = -2
+    assert (depth > 0).all()
+    normals = metrics.normals_from_depth(depth, camera, 0)
+    np.testing.assert_allclose(normals, np.broadcast_to(unit, normals.shape), atol=1e-9)
+
+
+def test_normals_turn_with_the_camera():
+    turn = np.array([[0.0, 0.0, 1.0, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])
+    camera = _camera(pose=turn[None])
+    _, directions = _camera().rays(0)
+    normals = metrics.normals_from_depth(3.0 / -directions[..., 2], camera, 0)
+    np.testing.assert_allclose(normals, np.broadcast_to(turn[:3, 2], normals.shape), atol=1e-9)
+
+
+def test_normals_are_missing_beside_a_hole():
+    camera = _camera()
+    depth = np.full((24, 30), 2.0)
+    depth[10, 10] = np.inf
+    missing = np.isnan(metrics.normals_from_depth(depth, camera, 0)).any(axis=-1)
+    assert sorted(map(tuple, np.argwhere(missing))) == [(9, 10), (10, 9), (10, 10), (10, 11), (11, 10)]
+
+
+def test_normal_errors_known_values():
+    angles = np.radians([[0.0, 20.0, 40.0], [180.0, 0.0, 0.0]])
+    preds = np.stack([np.sin(angles), np.zeros_like(angles), np.cos(angles)], axis=-1)
+    target = np.zeros_like(preds)
+    target[..., 2] = 1
+    target[1, 1] = np.nan
+    mask = np.array([[True, True, True], [True, True, False]])
+    found = metrics.normal_errors(preds, target, mask)  # 0, 20, 40, 180
+    assert found["normal_mean_deg"] == pytest.approx(60)
+    assert found["normal_median_deg"] == pytest.approx(30)
+    assert found["normal_pct_30"] == pytest.approx(0.5)
+
+
+def test_an_empty_mask_gives_nan_everywhere():
+    preds, target = _pair()
+    empty = np.zeros_like(FULL)
+    values = [
+        metrics.psnr(preds, target, empty, data_range=1.0),
+        metrics.ssim(preds, target, empty, data_range=1.0),
+        metrics.ssim(preds, target, empty, data_range=1.0, convention="premasked"),
+        metrics.depth_mse(preds[..., 0], target[..., 0], empty),
+        metrics.disparity_mae(preds[..., 0], target[..., 0], empty),
+        *metrics.normal_errors(preds, target, empty).values(),
+    ]
+    assert len(values) == 8
+    assert np.isnan(values).all()
+
+
+def test_coverage():
+    assert metrics.coverage(np.array([[True, False], [False, False]])) == 0.25
+    assert np.isnan(metrics.coverage(np.zeros((0, 2), dtype=bool)))
+    with pytest.raises(ValueError, match="must be bool"):
+        metrics.coverage(np.ones((2, 2)))
+
+
+def test_errors_name_function_argument_and_rule():
+    preds, target = _pair()
+    with pytest.raises(ValueError, match=r"psnr: preds must have shape \(H, W, C\), got \(24, 30\)"):
+        metrics.psnr(preds[..., 0], target[..., 0], FULL, data_range=1.0)
+    with pytest.raises(ValueError, match="psnr: target must have the shape of preds"):
+        metrics.psnr(preds, target[..., :1], FULL, data_range=1.0)
+    with pytest.raises(ValueError, match="ssim: mask must be bool of shape"):
+        metrics.ssim(preds, target, FULL.astype(float), data_range=1.0)
+    with pytest.raises(ValueError, match="data_range must be finite and > 0, got 0"):
+        metrics.psnr(preds, target, FULL, data_range=0)
+    with pytest.raises(ValueError, match="convention must be one of map_mean, premasked, got 'best'"):
+        metrics.ssim(preds, target, FULL, data_range=1.0, convention="best")
+    with pytest.raises(ValueError, match=r"backproject: depth must have shape \(24, 30\)"):
+        metrics.backproject(np.ones((30, 24)), _camera(), 0)
+
+
+def test_inputs_are_left_alone():
+    preds, target = _pair()
+    copies = preds.copy(), target.copy()
+    metrics.psnr(preds, target, FULL, data_range=1.0)
+    metrics.ssim(preds, target, FULL, data_range=1.0, convention="premasked")
+    metrics.normals_from_depth(preds[..., 0], _camera(), 0)
+    np.testing.assert_array_equal(preds, copies[0])
+    np.testing.assert_array_equal(target, copies[1])
