@@ -1,0 +1,253 @@
+"""Clean cubes: objects composed of random solids, cut at 1 to 20 percent of their extent, as voxels.
+
+Solids that cannot reach a cube are left out of its evaluation, so its cost does not grow with the object.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core import signed_distance as sd
+from ..core.frames import RESOLUTION, random_rotations, unit_lattice
+from .primitives import FAMILIES, Solid, log_uniform
+from .recipe import Recipe
+
+Array = NDArray[Any]
+Occupancy = NDArray[np.bool_]
+Operation = Literal["add", "blend", "cut"]
+
+_LATTICE = unit_lattice().reshape(-1, 3)
+_BALL_RADIUS = float(np.sqrt(3.0) / 2)  # of the cube's circumscribed ball, in edges
+
+
+@dataclass(frozen=True)
+class Part:
+    """One solid placed in an object: ``extent * solid(R^T (p - center) / extent)``, and how it joins the rest."""
+
+    solid: Solid
+    center: Array
+    rotation: Array
+    extent: float
+    operation: Operation = "add"
+    fillet: float = 0.0
+
+    def distance(self, positions: Array) -> Array:
+        """Signed distance ``(N,)`` at ``positions (N, 3)`` of the object."""
+        return self.solid((positions - self.center) @ (self.rotation / self.extent)) * self.extent
+
+
+@dataclass(frozen=True)
+class ComposedObject:
+    """Solids joined in order, about one unit across; ``extent`` is the longest side of its box."""
+
+    parts: tuple[Part, ...]
+    extent: float
+
+    def distance(self, positions: Array) -> Array:
+        """Signed distance bound ``(N,)`` at ``positions (N, 3)``."""
+        result: Array | None = None
+        for part in self.parts:
+            value = part.distance(positions)
+            if result is None:
+                result = value
+            elif part.operation == "add":
+                result = np.minimum(result, value)
+            elif part.operation == "blend":
+                result = sd.smooth_union(result, value, part.fillet)
+            else:
+                result = sd.difference(result, value)
+        return result if result is not None else np.full(len(positions), np.inf)
+
+    def near(self, center: Array, radius: float) -> ComposedObject:
+        """The object as a ball sees it: without the parts that cannot change the distance's sign in it."""
+        kept: list[Part] = []
+        for part in self.parts:
+            reach = (radius + part.fillet) * 1.1
+            if not kept and part.operation == "cut":
+                continue  # nothing to carve it out of
+            if float(part.distance(center[None])[0]) <= reach:
+                kept.append(part)
+        return replace(self, parts=tuple(kept))
+
+
+def _bumpy(rng: np.random.Generator, solid: Solid) -> Solid:
+    """Displace a surface by up to 0.004 to 0.05 along a periodic pattern of 1 to 12 periods a unit."""
+    rate, depth = log_uniform(rng, 1.0, 12.0) * 2 * np.pi, log_uniform(rng, 0.004, 0.05)
+    phase = rng.uniform(0, 2 * np.pi, size=3)
+    bound = 1.0 + depth * rate
+    return lambda p: (solid(p) + depth * np.prod(np.sin(p * rate + phase), axis=-1)) / bound
+
+
+def _hollow(rng: np.random.Generator, solid: Solid) -> Solid:
+    """The wall of a solid, 0.005 to 0.08 thick, open towards +z."""
+    thickness, opening = log_uniform(rng, 0.005, 0.08), rng.uniform(0.0, 0.4)
+    return lambda p: np.maximum(sd.shell(solid(p), thickness), p[..., 2] - opening)
+
+
+def _chopped(rng: np.random.Generator, solid: Solid, other: Solid) -> Solid:
+    """The common part of two solids, the other one moved by up to 0.3."""
+    shift = rng.uniform(-0.3, 0.3, size=3)
+    return lambda p: np.maximum(solid(p), other(p - shift))
+
+
+def _solid(rng: np.random.Generator, recipe: Recipe) -> Solid:
+    names = recipe.families or tuple(FAMILIES)
+    draw: Callable[[], Solid] = lambda: FAMILIES[names[int(rng.integers(len(names)))]](rng)  # noqa: E731
+    solid = draw()
+    if rng.random() < 0.1:
+        solid = _chopped(rng, solid, draw())
+    if rng.random() < recipe.hollow_share:
+        solid = _hollow(rng, solid)
+    if rng.random() < recipe.bumpy_share:
+        solid = _bumpy(rng, solid)
+    return solid
+
+
+def compose_object(rng: np.random.Generator, recipe: Recipe) -> ComposedObject:
+    """A random object: the first solid is the largest, the others are placed about it and added, blended or cut.
+
+    A third of the objects are axis-aligned among themselves, as furniture and rooms are.
+    """
+    count = round(log_uniform(rng, recipe.parts[0], recipe.parts[1]))
+    extents = np.sort(log_uniform(rng, *recipe.part_extent, count))[::-1]
+    extents = extents / extents[0]
+    rotations = random_rotations(rng, count)
+    if rng.random() < 0.34:
+        rotations[:] = rotations[0]
+    parts: list[Part] = []
+    for extent, rotation in zip(extents, rotations):
+        host = parts[int(rng.integers(len(parts)))] if parts else None
+        center = np.zeros(3) if host is None else host.center + rng.normal(size=3) * 0.25 * (host.extent + extent)
+        operation: Operation = "add"
+        if host is not None:
+            draw = rng.random()
+            if draw < recipe.cavity_share:
+                operation = "cut"
+            elif draw < recipe.cavity_share + recipe.smooth_share:
+                operation = "blend"
+        fillet = extent * log_uniform(rng, 0.02, 0.5) if operation == "blend" else 0.0
+        parts.append(Part(_solid(rng, recipe), center, rotation, float(extent), operation, float(fillet)))
+    low = np.min([part.center - part.extent / 2 for part in parts], axis=0)
+    high = np.max([part.center + part.extent / 2 for part in parts], axis=0)
+    return ComposedObject(tuple(parts), float((high - low).max()))
+
+
+def surface_point(rng: np.random.Generator, composed: ComposedObject, *, tries: int = 24) -> tuple[Array, Array]:
+    """A point on the surface and the unit normal there, both ``(3,)``.
+
+    A part is drawn, points about it are moved onto its surface by six Newton steps on its own distance,
+    and one of those that lie on the whole object's surface is taken (the nearest, if none does).
+    Parts are equally likely whatever their extent, which favours detail.
+    """
+    part = composed.parts[int(rng.integers(len(composed.parts)))]
+    points = part.center + rng.uniform(-0.55, 0.55, size=(tries, 3)) * part.extent
+    step = 1e-3 * part.extent
+    stencil = np.concatenate([np.zeros((1, 3)), np.eye(3) * step])[:, None, :]
+    normals = np.zeros_like(points)
+    for _ in range(6):
+        values = part.distance((points[None] + stencil).reshape(-1, 3)).reshape(4, -1)
+        normals = ((values[1:] - values[0]) / step).T
+        steepness = np.maximum((normals**2).sum(axis=1), 1e-2)
+        moves = normals * (values[0] / steepness)[:, None]
+        lengths = np.linalg.norm(moves, axis=1, keepdims=True)
+        points = points - moves * np.minimum(1.0, 0.5 * part.extent / np.maximum(lengths, 1e-12))
+    misses = np.abs(composed.distance(points))
+    hits = np.flatnonzero(misses < 2e-3 * part.extent)
+    chosen = int(hits[int(rng.integers(len(hits)))]) if len(hits) else int(np.argmin(misses))
+    normal = normals[chosen]
+    return points[chosen], normal / max(float(np.linalg.norm(normal)), 1e-12)
+
+
+def dilate(occupancy: Occupancy, iterations: int, *, faces_only: bool = False) -> Occupancy:
+    """Grow by ``iterations`` voxels, through 26 neighbours or the 6 that share a face; 0 is the identity.
+
+    Args:
+        occupancy: ``(R, R, R)`` bool.
+        iterations: >= 0.
+        faces_only: 6 neighbours rather than 26.
+    """
+    if iterations < 0:
+        raise ValueError(f"dilate: iterations must be >= 0, got {iterations}")
+    grown = occupancy.copy()
+    for _ in range(iterations):
+        source = grown.copy() if faces_only else grown
+        for axis in range(3):
+            before = source if faces_only else grown.copy()
+            ahead, behind = [slice(None)] * 3, [slice(None)] * 3
+            ahead[axis], behind[axis] = slice(1, None), slice(None, -1)
+            grown[tuple(ahead)] |= before[tuple(behind)]
+            grown[tuple(behind)] |= before[tuple(ahead)]
+    return grown
+
+
+def random_dilation(rng: np.random.Generator, occupancy: Occupancy, maximum: int) -> Occupancy:
+    """Dilate 0 to ``maximum`` times, each count half as likely as the one before."""
+    weights = 0.5 ** np.arange(maximum + 1)
+    count = int(rng.choice(maximum + 1, p=weights / weights.sum()))
+    return dilate(occupancy, count, faces_only=bool(rng.random() < 0.5))
+
+
+def shell_from_distance(distance: Array, *, thickness: float = 1.0) -> Occupancy:
+    """Voxels that a surface crosses, from distances at their centres.
+
+    A plane ``d + g . x = 0`` meets a voxel when ``|d| <= (|gx| + |gy| + |gz|) / 2`` with the gradient g per
+    voxel; g is the steeper of the two one-sided differences, so that sheets thinner than a voxel survive and
+    distances off by a factor (bounds) give the same shell as exact ones.
+
+    Args:
+        distance: ``(R, R, R)``, any unit.
+        thickness: 1 is the exact test for a plane.
+    """
+    slopes = np.zeros_like(distance)
+    for axis in range(3):
+        change = np.abs(np.diff(distance, axis=axis))
+        pad = [(0, 0)] * 3
+        pad[axis] = (1, 1)
+        padded = np.pad(change, pad)
+        low, high = [slice(None)] * 3, [slice(None)] * 3
+        low[axis], high[axis] = slice(None, -1), slice(1, None)
+        slopes += np.maximum(padded[tuple(low)], padded[tuple(high)])
+    result: Occupancy = np.abs(distance) <= 0.5 * thickness * slopes
+    return result
+
+
+def draw_offset(rng: np.random.Generator, recipe: Recipe, normal: Array) -> Array:
+    """Where a cube's centre lies, in edges, seen from a surface point ``(3,)``: on, near or away from it."""
+    draw = rng.random()
+    if draw < recipe.on_share:
+        return rng.uniform(-1.0, 1.0, size=3) * recipe.center_jitter
+    side = 1.0 if rng.random() < 0.75 else -1.0
+    if draw < recipe.on_share + recipe.near_share:
+        return normal * side * rng.uniform(0.0, 0.5) + rng.uniform(-0.25, 0.25, size=3)
+    return normal * side * rng.uniform(0.5, 0.85)
+
+
+def sample_cube(rng: np.random.Generator, recipe: Recipe) -> tuple[Occupancy, float]:
+    """One clean procedural cube.
+
+    Returns:
+        ``occupancy (32, 32, 32)`` bool and the cube's edge over the object's extent.
+    """
+    fraction = log_uniform(rng, *recipe.edge_fraction)
+    if rng.random() < recipe.empty_share:
+        return np.zeros((RESOLUTION,) * 3, dtype=bool), fraction
+    composed = compose_object(rng, recipe)
+    point, normal = surface_point(rng, composed)
+    edge = fraction * composed.extent
+    center = point + draw_offset(rng, recipe, normal) * edge
+    rotation = random_rotations(rng, 1)[0]
+    visible = composed.near(center, edge * _BALL_RADIUS)
+    positions = _LATTICE @ (rotation.T * edge) + center
+    distance = visible.distance(positions).reshape((RESOLUTION,) * 3)
+    thickness, solid = rng.uniform(*recipe.shell_thickness), rng.random() < recipe.solid_share
+    if not visible.parts:
+        return np.zeros((RESOLUTION,) * 3, dtype=bool), fraction
+    occupancy = shell_from_distance(distance.astype(np.float32), thickness=float(thickness))
+    if solid:
+        occupancy |= distance < 0
+    return random_dilation(rng, occupancy, recipe.max_dilation), fraction
