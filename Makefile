@@ -1,0 +1,78 @@
+# make demo   clean a ghost-ridden room on the CPU (installs megabytes, no torch)
+# make test   install everything and run every test
+# Each does all of its own set-up; a second run is quick. `make help` lists the rest.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
+PINS := -c constraints.txt
+MADE := $(VENV)/.made
+INPUTS := pyproject.toml constraints.txt
+SYSTEM_PACKAGES := libusb-1.0-0 libgl1 libegl1 libgomp1 libx11-6
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test check clean clean-all demo-setup
+
+help:
+	@echo "make demo       clean a synthetic room with labelled ghosts; writes out/demo/index.html (no torch)"
+	@echo "make test       set up everything, then run the whole test suite"
+	@echo "make setup      create .venv with every extra, pinned by constraints.txt"
+	@echo "make check      ruff, formatting, mypy"
+	@echo "make clean      remove caches and builds"
+	@echo "make clean-all  the same, and .venv"
+	@echo "PYTHON=python3.12 make …  to choose the interpreter (3.10 or later)"
+
+$(MADE)/venv:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' \
+		|| { echo "unghost needs Python 3.10 or later; try: make PYTHON=python3.12"; exit 1; }
+	@test -x $(BIN)/python && $(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv $(VENV) \
+		|| { rm -rf $(VENV); echo "no venv module: apt-get install python3-venv, then again"; exit 1; }
+	@mkdir -p $(MADE) && touch $@
+
+# The light half: what `unghost demo` uses and nothing else.
+$(MADE)/demo: $(INPUTS) | $(MADE)/venv
+	@echo "setting up $(VENV) for the demo (numpy, onnxruntime, scipy, matplotlib; no torch) …"
+	@$(PIP) install --quiet $(PINS) -e '.[demo]'
+	@touch $@
+
+# Everything. torch goes first and alone, so that whichever build of the pinned version the
+# configured index offers (the CPU one, if it does) is settled before anything else asks for it.
+$(MADE)/full: $(INPUTS) | $(MADE)/venv
+	@echo "setting up $(VENV) with everything (torch, open3d, …): a few minutes the first time …"
+	@$(PIP) install --quiet $(PINS) torch==2.13.0
+	@$(PIP) install --quiet $(PINS) -e '.[dev]'
+	@touch $(MADE)/demo $@
+
+# open3d is a wheel that expects a few system libraries. Never fatal: only the code that calls open3d needs them.
+$(MADE)/system: | $(MADE)/full
+	@if $(BIN)/python -c 'import open3d' >/dev/null 2>&1; then :; \
+	elif [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+		echo "installing $(SYSTEM_PACKAGES) for open3d"; \
+		{ apt-get -qq update && DEBIAN_FRONTEND=noninteractive apt-get -qq install -y --no-install-recommends \
+			$(SYSTEM_PACKAGES); } >/dev/null 2>&1 \
+			|| echo "could not install them; open3d stays unusable until: apt-get install $(SYSTEM_PACKAGES)"; \
+	else echo "open3d lacks system libraries; run: sudo apt-get install $(SYSTEM_PACKAGES)"; fi
+	@touch $@
+
+setup: $(MADE)/full $(MADE)/system
+
+demo-setup: $(MADE)/demo
+
+demo: demo-setup
+	@$(BIN)/unghost demo
+
+test: setup
+	$(BIN)/python -m pytest
+
+check: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+clean:
+	rm -rf build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +
+
+clean-all: clean
+	rm -rf $(VENV)

@@ -1,0 +1,32 @@
+"""``unghost.clean``: the cleaner with the shipped denoiser filled in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from .denoisers import load_denoiser
+from .regularizer.clean import clean as clean_with
+from .regularizer.keep_mask import KeepMask
+
+
+def clean(density_fn: Callable[..., Any], aabb: Any, *, denoiser: Any = None, **options: Any) -> KeepMask:
+    """Decide which parts of a trained density field to keep. No gradient, no training, no torch needed.
+
+    Args:
+        density_fn: ``positions (..., 3) -> density (..., 1) or (...)``, numpy or torch, >= 0 per scene unit.
+        aabb: ``(2, 3)`` smallest and largest corner, scene units; nothing outside it is changed.
+        denoiser: from :func:`unghost.load_denoiser`; None loads the shipped one through onnxruntime.
+        **options: those of :func:`unghost.regularizer.clean.clean`, ``field_pitch`` foremost.
+
+    Returns:
+        A :class:`KeepMask`: ``mask.apply(density_fn)`` is the cleaned field, ``mask.save("keep.npz")``
+        the undo, ``mask.summary()`` what was removed.
+
+    Raises:
+        ValueError: densities that are NaN, infinite, negative or of the wrong shape; an impossible box.
+
+    Example:
+        >>> mask = clean(lambda p: (abs(p) < 0.5).all(-1) * 50.0, [[-1, -1, -1], [1, 1, 1]])  # doctest: +SKIP
+    """
+    return clean_with(density_fn, aabb, denoiser=load_denoiser() if denoiser is None else denoiser, **options)

@@ -1,0 +1,45 @@
+"""The command ``unghost``: one verb each, arguments from the functions in :mod:`unghost.commands`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+USER_ERRORS = (ValueError, TypeError, OSError, ImportError)
+USAGE_EXIT, INTERRUPTED_EXIT = 2, 130
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one verb.
+
+    Args:
+        argv: the words after ``unghost``; those of the process if None.
+
+    Returns:
+        0, or the status that the verb chose. What the user can mend (a missing file, an impossible
+        value, a missing extra) prints one line, ``unghost VERB: message``, to stderr and gives 2.
+    """
+    import tyro
+
+    from .commands import VERBS
+
+    words = list(sys.argv[1:] if argv is None else argv)
+    verb = next((word for word in words if word in VERBS), "")
+    try:
+        status = tyro.extras.subcommand_cli_from_dict(
+            VERBS, prog="unghost", args=words, description="Take ghosts out of radiance fields."
+        )
+    except USER_ERRORS as error:
+        if isinstance(error, ImportError) and (error.name or "").startswith(__package__):
+            raise  # a part of ours is missing: not the user's doing
+        message = " ".join(str(error).split()) or type(error).__name__
+        print(f"unghost {verb}: {message}", file=sys.stderr)
+        return USAGE_EXIT
+    except KeyboardInterrupt:
+        print(f"unghost {verb}: interrupted", file=sys.stderr)
+        return INTERRUPTED_EXIT
+    return int(status or 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

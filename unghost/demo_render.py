@@ -1,0 +1,128 @@
+"""A small volume renderer in numpy: emission and absorption along rays, with a sun, a sky and soft shade."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .core.cameras import Cameras
+
+Floats = NDArray[np.float32]
+SUN = np.array([0.42, -0.50, 0.76]) / np.linalg.norm([0.42, -0.50, 0.76])
+PAPER = np.array([0.965, 0.955, 0.94], dtype=np.float32)  # the page's background
+
+
+@dataclass(frozen=True)
+class Volume:
+    """``samples (X, Y, Z, 4)``: shaded red, green, blue and optical depth per cell; ``aabb (2, 3)``; ``pitch``."""
+
+    samples: Floats
+    aabb: NDArray[np.float64]
+    pitch: float
+
+
+def look_at(eye: Any, target: Any, *, width: int, height: int, fov_degrees: float) -> Cameras:
+    """One camera at ``eye`` that looks at ``target`` with z up; ``fov_degrees`` is horizontal."""
+    eye, target = np.asarray(eye, dtype=float), np.asarray(target, dtype=float)
+    back = (eye - target) / np.linalg.norm(eye - target)
+    right = np.cross([0.0, 0.0, 1.0], back)
+    right /= np.linalg.norm(right)
+    pose = np.stack([right, np.cross(back, right), back, eye], axis=1)
+    focal = 0.5 * width / np.tan(np.radians(fov_degrees) / 2)
+    return Cameras.create(pose[None], np.array([focal, focal, width / 2, height / 2]), width, height)
+
+
+def _sunlight(depth: Floats) -> Floats:
+    """Share of the sun that reaches each cell: slabs swept from the top, each shifted along the sun's slant."""
+    from scipy.ndimage import shift
+
+    light = np.ones_like(depth)
+    slant = SUN[:2] / SUN[2]
+    longer = np.float32(1.0 / SUN[2])
+    for z in range(depth.shape[2] - 2, -1, -1):
+        above = light[..., z + 1] * np.exp(-depth[..., z + 1] * longer)
+        light[..., z] = shift(above, -slant, order=1, mode="nearest")
+    return light
+
+
+def shade(density: Floats, color: Floats, aabb: NDArray[np.float64], pitch: float) -> Volume:
+    """Light a density grid.
+
+    Args:
+        density: ``(X, Y, Z)`` per scene unit, >= 0.
+        color: ``(X, Y, Z, 3)`` albedo in [0, 1].
+        aabb: ``(2, 3)``, scene units.
+        pitch: side of a cell, scene units.
+    """
+    from scipy.ndimage import gaussian_filter, maximum_filter
+
+    depth = np.minimum(density * pitch, 8.0).astype(np.float32)
+    solid = gaussian_filter(1.0 - np.exp(-depth), 1.0)
+    gradient = np.stack(np.gradient(solid), axis=-1)
+    steep = np.linalg.norm(gradient, axis=-1, keepdims=True)
+    normal = -gradient / np.maximum(steep, 1e-6)
+    facing = np.clip(normal @ SUN.astype(np.float32), 0.0, 1.0)
+    facing = 0.35 + (facing - 0.35) * np.clip(steep[..., 0] / 0.12, 0.0, 1.0)  # fog has no face
+    sky = np.clip(1.15 - 1.3 * gaussian_filter(1.0 - np.exp(-depth), 4.0), 0.25, 1.0)
+    sun = gaussian_filter(maximum_filter(_sunlight(depth), 3), 0.7)  # a surface must not shade itself
+    warm = np.array([1.05, 0.98, 0.88], dtype=np.float32)
+    cool = np.array([0.56, 0.60, 0.66], dtype=np.float32)
+    light = sky[..., None] * cool + (0.95 * sun * facing)[..., None] * warm
+    shaded = np.clip(color * light, 0.0, 1.0) ** np.float32(1 / 1.15)
+    return Volume(np.concatenate([shaded, depth[..., None]], axis=-1).astype(np.float32), aabb, pitch)
+
+
+def _interval(aabb: NDArray[np.float64], origins: Any, directions: Any) -> tuple[Any, Any]:
+    """Where each ray enters and leaves the box."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        crossings = (aabb[:, None] - origins) / directions
+    near = np.nanmax(crossings.min(axis=0), axis=-1)
+    return np.maximum(near, 0.0), np.nanmin(crossings.max(axis=0), axis=-1)
+
+
+def _trilinear(samples: Floats, where: Floats) -> Floats:
+    """``samples (X, Y, Z, C)`` at fractional indices ``where (n, 3)``, ``(n, C)``."""
+    shape = np.array(samples.shape[:3])
+    where = np.clip(where, 0.0, shape - 1.001)
+    low = where.astype(np.int32)
+    share = (where - low).astype(np.float32)
+    strides = np.array([shape[1] * shape[2], shape[2], 1])
+    base, flat = low @ strides, samples.reshape(-1, samples.shape[-1])
+    total = np.zeros((len(where), samples.shape[-1]), dtype=np.float32)
+    for corner in np.ndindex(2, 2, 2):
+        weight = np.where(corner, share, 1.0 - share).prod(axis=-1)
+        total += weight[:, None] * flat[base + int(np.dot(corner, strides))]
+    return total
+
+
+def render(volume: Volume, camera: Cameras, *, steps_per_cell: float = 1.6) -> Floats:
+    """March every pixel's ray through the volume; ``(height, width, 3)`` in [0, 1] on a paper background."""
+    from scipy.ndimage import maximum_filter
+
+    origins, directions = (values.reshape(-1, 3) for values in camera.rays(0))
+    near, far = _interval(volume.aabb, origins, directions)
+    step = volume.pitch / steps_per_cell
+    shape = np.array(volume.samples.shape[:3])
+    busy = maximum_filter(volume.samples[..., 3], 3) > 0.004  # empty cells are skipped without a look
+    color, clear = np.zeros((len(near), 3), dtype=np.float32), np.ones(len(near), dtype=np.float32)
+    alive = np.flatnonzero(far > near)
+    start = ((origins - volume.aabb[0]) / volume.pitch - 0.5).astype(np.float32)
+    along = (directions / volume.pitch).astype(np.float32)
+    travel = (near + 0.5 * step).astype(np.float32)
+    while len(alive):
+        where = start[alive] + along[alive] * travel[alive, None]
+        cell = np.clip(np.rint(where), 0, shape - 1).astype(np.int32)
+        hit = busy[cell[:, 0], cell[:, 1], cell[:, 2]]
+        rays = alive[hit]
+        if len(rays):
+            sample = _trilinear(volume.samples, where[hit])
+            opacity = 1.0 - np.exp(-sample[:, 3] / np.float32(steps_per_cell))
+            color[rays] += (clear[rays] * opacity)[:, None] * sample[:, :3]
+            clear[rays] *= 1.0 - opacity
+        travel[alive] += np.float32(step)
+        alive = alive[(travel[alive] < far[alive]) & (clear[alive] > 0.01)]
+    image = color + clear[:, None] * PAPER
+    return np.asarray(np.clip(image, 0, 1).reshape(camera.height, camera.width, 3), dtype=np.float32)

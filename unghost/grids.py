@@ -1,0 +1,74 @@
+"""A density grid as a density field: trilinear interpolation in numpy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .core.aabb import as_aabb
+
+DensityFn = Callable[[NDArray[Any]], NDArray[np.float32]]
+
+
+def cell_centers(aabb: ArrayLike, shape: tuple[int, int, int]) -> NDArray[np.float32]:
+    """Centres of the cells of a grid that fills ``aabb``, ``(*shape, 3)`` float32, index order ``[x, y, z]``."""
+    box = as_aabb(aabb, caller="cell_centers")
+    axes = [low + (np.arange(n) + 0.5) * (high - low) / n for low, high, n in zip(box[0], box[1], shape)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).astype(np.float32)
+
+
+def cell_pitch(aabb: ArrayLike, shape: tuple[int, ...], *, caller: str = "cell_pitch") -> float:
+    """Side of the cells, scene units.
+
+    Raises:
+        ValueError: the cells are not cubes (sides differ by more than 1 %).
+    """
+    box = as_aabb(aabb, caller=caller)
+    sides = (box[1] - box[0]) / np.array(shape, dtype=float)
+    if sides.max() > 1.01 * sides.min():
+        raise ValueError(f"{caller}: aabb and grid must make cubic cells (to 1 %), got sides {sides.round(6).tolist()}")
+    return float(sides.mean())
+
+
+def grid_density_fn(density: NDArray[Any], aabb: ArrayLike) -> DensityFn:
+    """The field that interpolates ``density (X, Y, Z)`` trilinearly between cell centres.
+
+    Beyond the outermost centres the nearest value holds; outside ``aabb`` the density is 0.
+
+    Returns:
+        ``positions (..., 3) -> density (..., 1)`` float32, per scene unit.
+
+    Raises:
+        ValueError: ``density`` is not three-dimensional, or the box is impossible.
+
+    Example:
+        >>> field = grid_density_fn(np.array([[[0.0]], [[4.0]]]), [[0, 0, 0], [2, 1, 1]])
+        >>> field(np.array([[1.0, 0.5, 0.5]])).item()
+        2.0
+    """
+    values = np.asarray(density, dtype=np.float32)
+    if values.ndim != 3 or 0 in values.shape:
+        raise ValueError(f"grid_density_fn: density must have shape (X, Y, Z), got {values.shape}")
+    box = as_aabb(aabb, caller="grid_density_fn")
+    shape = np.array(values.shape)
+    strides = np.array([shape[1] * shape[2], shape[2], 1])
+    flat = values.ravel()
+
+    def density_fn(positions: NDArray[Any]) -> NDArray[np.float32]:
+        points = np.asarray(positions, dtype=np.float64)
+        inside = ((points >= box[0]) & (points <= box[1])).all(axis=-1)
+        where = np.clip((points - box[0]) / (box[1] - box[0]) * shape - 0.5, 0.0, shape - 1.0)
+        low = np.minimum(np.floor(where).astype(np.int64), np.maximum(shape - 2, 0))
+        share = (where - low).astype(np.float32)
+        step = np.where(shape > 1, strides, 0)
+        base = low @ strides
+        total = np.zeros(points.shape[:-1], dtype=np.float32)
+        for corner in np.ndindex(2, 2, 2):
+            weight = np.where(corner, share, 1.0 - share).prod(axis=-1)
+            total += weight * flat[base + int(np.dot(corner, step))]
+        return np.where(inside, total, np.float32(0.0))[..., None]
+
+    return density_fn
