@@ -1,0 +1,124 @@
+"""The two losses of the paper on densities, pure and unreduced.
+
+Gradients flow through ``density`` only; what the denoiser predicted enters as a mask.
+"""
+
+from __future__ import annotations
+
+import math
+
+try:
+    import torch
+    from torch import Tensor
+except ImportError as error:  # pragma: no cover - exercised in a subprocess
+    raise ImportError("unghost.regularizer.losses needs torch: pip install unghost[torch]") from error
+
+from ..core.occupancy import DECISION
+
+
+def upcast(density: Tensor) -> Tensor:
+    """Half precision to float32; float32 and float64 as they are."""
+    if not density.is_floating_point():
+        raise TypeError(f"upcast: density must be a floating-point tensor, got {density.dtype}")
+    return density.float() if density.dtype in (torch.float16, torch.bfloat16) else density
+
+
+def widest(tensor: Tensor) -> Tensor:
+    """To float64, or float32 on devices that have no float64 (mps)."""
+    return tensor.float() if tensor.device.type == "mps" else tensor.double()
+
+
+def dsds_loss(
+    density: Tensor,
+    x0_pred: Tensor,
+    *,
+    target_density: float | Tensor,
+    threshold: float = DECISION,
+    fill_threshold: float | None = None,
+) -> Tensor:
+    r"""Density score distillation (the paper, eq. 2): push density out of empty voxels and into occupied ones.
+
+    .. math:: m \sigma + (1 - m) \max(w - \sigma, 0), \qquad m = [\hat x_0 < threshold]
+
+    Departure: with ``fill_threshold > threshold``, voxels between the two are left alone.
+
+    Args:
+        density: ``(...)``, finite, >= 0, per scene unit (or an optical depth, with ``target_density`` to match).
+        x0_pred: the same shape, [-1, 1]; not differentiated.
+        target_density: ``w``, >= 0; a number, or a tensor of the same rank whose every axis but the first is 1.
+        threshold: ``x0_pred`` below it means empty.
+        fill_threshold: ``x0_pred`` at or above it means occupied; None for ``threshold``.
+
+    Returns:
+        The unreduced loss, the shape of ``density``, at least float32. Finite wherever ``density`` is.
+
+    Raises:
+        ValueError: shapes differ, or ``fill_threshold < threshold``.
+
+    Example:
+        >>> import torch
+        >>> density, x0_pred = torch.tensor([3.0, 0.5, 3.0]), torch.tensor([-1.0, 1.0, 1.0])
+        >>> dsds_loss(density, x0_pred, target_density=2.0).tolist()
+        [3.0, 1.5, 0.0]
+    """
+    if x0_pred.shape != density.shape:
+        raise ValueError(f"dsds_loss: x0_pred must have shape {tuple(density.shape)}, got {tuple(x0_pred.shape)}")
+    fill = threshold if fill_threshold is None else fill_threshold
+    if not (math.isfinite(threshold) and math.isfinite(fill) and fill >= threshold):
+        raise ValueError(f"dsds_loss: fill_threshold must be finite and >= threshold={threshold}, got {fill}")
+    values, prediction = upcast(density), x0_pred.detach()
+    target = _target(target_density, values)
+    penalty = torch.where(prediction < threshold, values, torch.zeros_like(values))
+    return penalty + torch.where(prediction >= fill, torch.relu(target - values), torch.zeros_like(values))
+
+
+def _target(target_density: float | Tensor, density: Tensor) -> Tensor:
+    """``w`` as a tensor beside ``density``, refusing anything that would broadcast by accident."""
+    if not isinstance(target_density, Tensor):
+        if not (math.isfinite(target_density) and target_density >= 0):
+            raise ValueError(f"dsds_loss: target_density must be finite and >= 0, got {target_density}")
+        return density.new_tensor(target_density)
+    per_cube = (len(density), *[1] * (density.ndim - 1)) if density.ndim else ()
+    if tuple(target_density.shape) not in ((), per_cube, tuple(density.shape)):
+        raise ValueError(
+            f"dsds_loss: target_density must be a number or have shape {per_cube}, got {tuple(target_density.shape)}"
+        )
+    return target_density.detach().to(density)
+
+
+def visibility_loss(density: Tensor, view_count: Tensor, *, min_views: int = 1) -> Tensor:
+    r"""Density where no camera looks (the paper, eq. 3): :math:`V(q) \sigma(q)`, :math:`V = [views < min\_views]`.
+
+    Args:
+        density: ``(...)``, finite, >= 0, per scene unit (or an optical depth).
+        view_count: the same shape, integers: how many cameras see the point; not differentiated.
+        min_views: a point seen by fewer is penalised; the paper's eq. 3 has 1.
+
+    Returns:
+        The unreduced loss, the shape of ``density``, at least float32.
+
+    Raises:
+        ValueError: shapes differ, or ``min_views < 1``.
+    """
+    if view_count.shape != density.shape:
+        raise ValueError(
+            f"visibility_loss: view_count must have shape {tuple(density.shape)}, got {tuple(view_count.shape)}"
+        )
+    if min_views < 1:
+        raise ValueError(f"visibility_loss: min_views must be >= 1, got {min_views}")
+    values = upcast(density)
+    return torch.where(view_count < min_views, values, torch.zeros_like(values))
+
+
+def stable_mean(loss: Tensor, *, count: int | None = None) -> Tensor:
+    """Mean that no finite loss can overflow: each term is divided before the sum, which runs in float64.
+
+    Args:
+        loss: ``(...)``.
+        count: divide by this instead of the number of elements; >= 1.
+
+    Returns:
+        Scalar float64 (float32 on mps); exactly 0 for an empty tensor.
+    """
+    wide = widest(loss)
+    return (wide / max(loss.numel() if count is None else count, 1)).sum()

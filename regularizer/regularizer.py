@@ -1,0 +1,291 @@
+"""The two lines of a training loop: losses on any density callable."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+try:
+    import torch
+    from torch import Tensor
+except ImportError as error:  # pragma: no cover - exercised in a subprocess
+    raise ImportError("unghost.regularizer.regularizer needs torch: pip install unghost[torch]") from error
+
+from ..core.aabb import as_aabb, scene_extent
+from ..core.arrays import to_numpy
+from ..core.cameras import Cameras
+from ..core.manifest import Denoiser
+from ..core.occupancy import DECISION, EMPTY, check_density, check_density_shape, opacity_from_density
+from ..core.schedule import check_timestep
+from .cubes import CubeBatch, FieldPitch, draw_cubes, wide_dtype
+from .denoise import check_denoiser, run_denoiser
+from .losses import dsds_loss, stable_mean, upcast, visibility_loss, widest
+from .proposals import ImportanceGrid
+from .queries import field_device
+from .settings import RegularizerSettings
+from .visibility import ViewCounter, grow_box, visibility_points
+
+DensityFn = Callable[[Any], Any]
+
+NOMINAL_CELLS = 128  # a field whose pitch is unknown is taken to have this many cells along the longest side
+POINTS_PER_CELL = 4  # asked of the field to fill the importance grid at the first call
+
+
+class DensityRegularizer:
+    """Adds a learned prior over local geometry, and a visibility prior, to the loss of any radiance field.
+
+    Each call draws cubes of the scene where there is matter, asks the field for their densities, lets the
+    denoiser say what should be there (one step, no gradient through it), and returns the DSDS loss (the
+    paper, eq. 2); and penalises density where no camera looks (eq. 3).
+
+    Departures from the paper: under the opacity rule (the default) the losses act on the optical depth
+    ``density * pitch`` rather than on the density, so the weights do not depend on the scene's unit, and a voxel
+    counts as occupied by its opacity; ``OccupancyRule.paper()`` restores raw densities, bits and tau = w = 0.01.
+    A cube without one occupied voxel is not sent to the denoiser: all of it counts as empty (m = 1), so faint
+    density there is still pushed out. Voxels outside the box are shown as empty and left out of the loss.
+
+    Losses are means over the voxels (points) in the box, times their weight; those of several fields are added.
+
+    Args:
+        denoiser: of one channel, kind ``"numpy"`` or ``"torch"``.
+        aabb: ``(2, 3)``, scene units: where to clean.
+        cameras: of the training photos; None for no visibility loss.
+        field_pitch: side of the field's own cells in scene units, or a function of cube centres ``(N, 3)``
+            that gives it as ``(N,)`` (a contracted field); None if unknown: then the cube's voxel.
+        device: where positions are created; None for the device of the field's parameters, else the CPU.
+        settings: see :class:`RegularizerSettings`; ``overrides`` replace single ones.
+
+    Attributes:
+        grid: the importance grid.
+        step: calls so far; cubes of step s depend on (seed, s) and the grid alone.
+        report: counts of the last call: cubes, skipped_empty, denoised, voxels, outside, dropped, points, unseen.
+        totals: the same since the start, and observations_outside.
+
+    Example:
+        >>> regularizer = DensityRegularizer(denoiser, aabb=aabb, cameras=cameras)  # doctest: +SKIP
+        >>> loss = photometric + sum(regularizer(field.density_fn).values())  # doctest: +SKIP
+    """
+
+    def __init__(
+        self,
+        denoiser: Denoiser,
+        *,
+        aabb: ArrayLike,
+        cameras: Cameras | None = None,
+        field_pitch: FieldPitch = None,
+        device: torch.device | str | None = None,
+        settings: RegularizerSettings | None = None,
+        **overrides: Any,
+    ) -> None:
+        known = {item.name for item in dataclasses.fields(RegularizerSettings)}
+        if set(overrides) - known:
+            raise TypeError(
+                f"DensityRegularizer: unknown settings {sorted(set(overrides) - known)}; known are {sorted(known)}"
+            )
+        self.settings = dataclasses.replace(settings or RegularizerSettings(), **overrides)
+        self.aabb = as_aabb(aabb, caller="DensityRegularizer")
+        self.denoiser = check_denoiser(denoiser, caller="DensityRegularizer")
+        if field_pitch is not None and not callable(field_pitch) and not 0 < field_pitch < np.inf:
+            raise ValueError(f"DensityRegularizer: field_pitch must be finite and > 0, got {field_pitch}")
+        self.field_pitch, self.device, self.cameras = field_pitch, device, cameras
+        s = self.settings
+        self.threshold = denoiser.manifest.removal_threshold if s.threshold is None else s.threshold
+        self.fill_threshold = max(self.threshold, DECISION) if s.fill_threshold is None else s.fill_threshold
+        if self.fill_threshold < self.threshold:
+            raise ValueError(
+                f"DensityRegularizer: fill_threshold must be >= threshold={self.threshold}, got {self.fill_threshold}"
+            )
+        self.grid = ImportanceGrid(self.aabb, resolution=s.grid_resolution, decay=s.grid_decay)
+        self._views = ViewCounter(cameras, min_views=s.min_views) if cameras is not None and len(cameras) else None
+        self.step = 0
+        self.report: Counter[str] = Counter()
+        self.totals: Counter[str] = Counter()
+
+    def __call__(self, density_fn: DensityFn | Sequence[DensityFn]) -> dict[str, Tensor]:
+        """The weighted losses of one step.
+
+        Args:
+            density_fn: ``positions (M, 3) float32 tensor -> density (M, 1) or (M,)``, differentiable; or a list of
+                them, the main field first (proposal networks must be cleaned too). All see the same cubes.
+
+        Returns:
+            ``{"dsds": …, "visibility": …}``: scalars (float64, so that no finite density overflows), exactly zero
+            where switched off.
+
+        Raises:
+            TypeError, ValueError: what a callable returned is no tensor, of the wrong shape, NaN, infinite, negative.
+        """
+        fields: list[Any] = (
+            list(density_fn) if isinstance(density_fn, (Sequence, torch.nn.ModuleList)) else [density_fn]
+        )
+        if not fields:
+            raise ValueError("DensityRegularizer: density_fn must be a callable or a non-empty list of them")
+        for field in fields:
+            if not callable(field):
+                raise TypeError(f"DensityRegularizer: density_fn must be callable, got {type(field).__name__}")
+        device = torch.device(self.device if self.device is not None else field_device(fields[0]) or "cpu")
+        self.report = Counter()
+        losses = {"dsds": self._dsds(fields, device), "visibility": self._visibility(fields, device)}
+        self.totals.update(self.report)
+        self.step += 1
+        return losses
+
+    def observe(self, positions: Any, values: Any, *, kind: Literal["density", "weight"] = "density") -> None:
+        """Tell the importance grid what you rendered anyway; never needed, always cheap.
+
+        Args:
+            positions: ``(..., 3)`` array or tensor, scene units; those outside the box are dropped and counted.
+            values: ``(...)`` or ``(..., 1)``: densities per scene unit, or accumulation weights in [0, 1].
+            kind: which of the two.
+        """
+        if kind not in ("density", "weight"):
+            raise ValueError(f"DensityRegularizer.observe: kind must be 'density' or 'weight', got {kind!r}")
+        amounts, points = _as_float64(values), _as_float64(positions)
+        if kind == "density" and self.settings.rule.kind == "opacity":
+            valid = np.where(np.isfinite(amounts) & (amounts >= 0), amounts, 0.0)
+            amounts = np.where(valid == amounts, opacity_from_density(valid, self._nominal_pitch()), amounts)
+        self.totals["observations_outside"] += self.grid.observe(points, amounts)
+
+    def state_dict(self) -> dict[str, Any]:
+        """What a resumed run needs: step, grid values, which cells were observed."""
+        return {"step": self.step, "values": self.grid.values.copy(), "observed": self.grid.observed.copy()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Inverse of :meth:`state_dict`."""
+        if np.shape(state["values"]) != self.grid.values.shape:
+            raise ValueError(
+                f"DensityRegularizer.load_state_dict: values must have shape {self.grid.values.shape}, "
+                f"got {np.shape(state['values'])}"
+            )
+        self.step = int(state["step"])
+        self.grid.values, self.grid.observed = np.array(state["values"], float), np.array(state["observed"], bool)
+
+    def _rng(self, stream: int) -> np.random.Generator:
+        return np.random.default_rng([self.settings.seed, self.step, stream])
+
+    def _nominal_pitch(self) -> float:
+        """Cell side for points that belong to no cube."""
+        if isinstance(self.field_pitch, (int, float)):
+            return float(self.field_pitch)
+        return scene_extent(self.aabb) / NOMINAL_CELLS
+
+    def _query(self, field: DensityFn, positions: Tensor) -> tuple[Tensor, Tensor]:
+        """Densities ``(M,)`` at ``(M, 3)``, in chunks, and which of them are valid (all, unless dropping)."""
+        if len(positions) == 0:
+            return positions.new_zeros(0), torch.ones(0, dtype=torch.bool, device=positions.device)
+        parts = []
+        for part in torch.split(positions, self.settings.chunk):
+            density = field(part)
+            if not isinstance(density, Tensor):
+                raise TypeError(
+                    f"DensityRegularizer: density_fn must return a torch tensor, got {type(density).__name__}"
+                )
+            parts.append(upcast(check_density_shape(density, part, caller="DensityRegularizer")))
+        values = torch.cat(parts)
+        if not self.settings.drop_invalid:
+            check_density(values.detach(), positions, caller="DensityRegularizer")
+            return values, torch.ones_like(values, dtype=torch.bool)
+        valid = torch.isfinite(values.detach()) & (values.detach() >= 0)
+        self.report["dropped"] += int((~valid).sum())
+        return torch.where(valid, values, torch.zeros_like(values)), valid
+
+    def _bootstrap(self, field: DensityFn, device: torch.device) -> None:
+        """Fill a grid that has seen nothing by asking the field in every cell."""
+        points = self.grid.cell_points(self._rng(2), POINTS_PER_CELL)
+        positions = torch.as_tensor(points, dtype=torch.float32, device=device)
+        with torch.no_grad():
+            density, valid = self._query(field, positions)
+        self._refresh(positions[valid], density[valid], self._nominal_pitch())
+
+    def _refresh(self, positions: Tensor, density: Tensor, pitch: Tensor | float) -> None:
+        """Opacities (or, under the density rule, densities) into the grid."""
+        if self.settings.rule.kind == "opacity":
+            density = opacity_from_density(widest(density.detach()), pitch)
+        self.grid.observe(positions, density.detach())
+
+    def _dsds(self, fields: list[DensityFn], device: torch.device) -> Tensor:
+        s = self.settings
+        if s.dsds_weight == 0 or s.cubes == 0:
+            return torch.zeros((), dtype=wide_dtype(device), device=device)
+        if not self.grid.observed.any():
+            self._bootstrap(fields[0], device)
+        cubes = draw_cubes(
+            self.grid, self._rng(0), s, field_pitch=self.field_pitch,
+            resolution=self.denoiser.manifest.resolution, device=device,
+        )  # fmt: skip
+        self.report.update(cubes=s.cubes, voxels=cubes.inside.numel(), outside=int((~cubes.inside).sum()))
+        losses = [self._dsds_of_field(field, cubes, main=index == 0) for index, field in enumerate(fields)]
+        return torch.stack(losses).sum() * s.dsds_weight
+
+    def _dsds_of_field(self, field: DensityFn, cubes: CubeBatch, *, main: bool) -> Tensor:
+        """Mean over the voxels in the box, unweighted."""
+        values, valid = self._query(field, cubes.positions[cubes.inside])
+        density = values.new_zeros(cubes.inside.shape).masked_scatter(cubes.inside, values)
+        used = cubes.inside.clone().masked_scatter(cubes.inside, valid)
+        if main:
+            self._refresh(*cubes.thinned(density.detach(), used))
+        x0_pred = self._predict(density.detach(), cubes)
+        depth = widest(density) * cubes.pitch if self.settings.rule.kind == "opacity" else density
+        loss = dsds_loss(
+            depth,
+            x0_pred.to(depth),
+            target_density=float(self.settings.rule.density_threshold(1.0)),
+            threshold=self.threshold,
+            fill_threshold=self.fill_threshold,
+        )
+        return stable_mean(torch.where(used, loss, torch.zeros_like(loss)), count=int(used.sum()))
+
+    def _predict(self, density: Tensor, cubes: CubeBatch) -> Tensor:
+        """``x0_pred (N, R, R, R)`` float32; all empty for cubes that were not worth asking about."""
+        s = self.settings
+        wide = widest(density)
+        x0_pred = torch.full_like(density, EMPTY, dtype=torch.float32)
+        asked = torch.ones(len(density), dtype=torch.bool, device=density.device)
+        if s.skip_empty:
+            asked = s.rule.occupied(wide, cubes.pitch).flatten(1).any(dim=1)
+        self.report.update(denoised=int(asked.sum()), skipped_empty=int((~asked).sum()))
+        if not bool(asked.any()):
+            return x0_pred
+        channels = s.rule.encode(wide[asked], cubes.pitch[asked], soft=s.soft).float()[:, None]
+        t = s.timestep(self.step) if callable(s.timestep) else s.timestep
+        t = self.denoiser.manifest.default_timestep if t is None else t
+        timestep = int(check_timestep(t, caller="DensityRegularizer"))
+        x0_pred[asked] = run_denoiser(
+            self.denoiser, channels, timestep, cubes.edge_fraction[asked.cpu().numpy()], caller="DensityRegularizer"
+        )[:, 0]
+        return x0_pred
+
+    def _visibility(self, fields: list[DensityFn], device: torch.device) -> Tensor:
+        s = self.settings
+        zero = torch.zeros((), dtype=wide_dtype(device), device=device)
+        if self._views is None or self.cameras is None or s.visibility_weight == 0 or s.visibility_samples == 0:
+            return zero
+        box = grow_box(self.aabb, s.visibility_reach)
+        points = visibility_points(
+            self._rng(1), s.visibility_samples, aabb=box, cameras=self.cameras, kind=s.visibility_kind
+        )
+        counts = self._views(points)
+        unseen = counts < s.min_views
+        self.report.update(points=len(points), unseen=int(unseen.sum()))
+        if not unseen.any():
+            return zero
+        positions = torch.as_tensor(points[unseen], dtype=torch.float32, device=device)
+        views = torch.as_tensor(counts[unseen], device=device)
+        total = zero
+        for field in fields:  # seen points add nothing, so the field is not asked about them
+            density, valid = self._query(field, positions)
+            depth = widest(density) * self._nominal_pitch() if s.rule.kind == "opacity" else density
+            loss = visibility_loss(depth, views, min_views=s.min_views)
+            total = total + stable_mean(torch.where(valid, loss, torch.zeros_like(loss)), count=len(points))
+        return total * s.visibility_weight
+
+
+def _as_float64(values: Any) -> NDArray[np.float64]:
+    """An array or tensor (bfloat16 too, which numpy does not know) as a float64 array."""
+    plain = upcast(values.detach()) if isinstance(values, Tensor) else values
+    return np.asarray(to_numpy(plain), dtype=np.float64)

@@ -1,0 +1,97 @@
+"""What can be set of a :class:`DensityRegularizer`; validated, saved with the run."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from ..core.occupancy import OccupancyRule
+from ..core.schedule import check_timestep
+from .proposals import Strategy
+from .visibility import PointKind
+
+Timestep = int | Callable[[int], int] | None
+
+
+@dataclass(frozen=True)
+class RegularizerSettings:
+    """Numbers of the regularizer, with where they come from.
+
+    Attributes:
+        cubes: cubes a step (40: the paper).
+        edge_range: lowest and highest cube edge as fractions of the scene extent; None: .5-1.25 field cells a
+            voxel where ``field_pitch`` is known, else the paper's .01-.1.
+        strategy: ``"mixed"``, ``"importance"`` or ``"uniform"`` cube centres.
+        uniform_share: of the mixed strategy, in [0, 1].
+        timestep: for the denoiser; None for its default, or a function of the step.
+        threshold: ``x0_pred`` below it is pushed out; None for the manifest's ``removal_threshold``.
+        fill_threshold: ``x0_pred`` at or above it is filled; None for 0 (the paper) or ``threshold`` if higher.
+        dsds_weight, visibility_weight: factors of the losses; 0 switches one off, its queries too. Under the
+            opacity rule the losses are optical depths per cell, so the weights do not depend on the scene's unit.
+        visibility_samples: points a step for the visibility loss.
+        visibility_kind: ``"mixed"``, ``"rays"`` (the paper) or ``"uniform"`` points.
+        visibility_reach: how many times the aabb those points may go out to, >= 1.
+        min_views: points seen by fewer cameras are penalised (1: the paper).
+        rule: density to occupancy.
+        soft: show the denoiser opacities rather than bits (opacity rule only).
+        skip_empty: do not send cubes without an occupied voxel to the denoiser; see ``DensityRegularizer``.
+        drop_invalid: leave NaN, infinite and negative densities out of the loss and count them, instead of raising.
+        grid_resolution, grid_decay: of the importance grid (20: the paper).
+        chunk: most positions handed to a density function at once.
+        seed: of everything random.
+    """
+
+    cubes: int = 40
+    edge_range: tuple[float, float] | None = None
+    strategy: Strategy = "mixed"
+    uniform_share: float = 0.25
+    timestep: Timestep = None
+    threshold: float | None = None
+    fill_threshold: float | None = None
+    dsds_weight: float = 0.1
+    visibility_weight: float = 0.1
+    visibility_samples: int = 8192
+    visibility_kind: PointKind = "mixed"
+    visibility_reach: float = 1.0
+    min_views: int = 1
+    rule: OccupancyRule = dataclasses.field(default_factory=OccupancyRule)
+    soft: bool = True
+    skip_empty: bool = True
+    drop_invalid: bool = False
+    grid_resolution: int = 20
+    grid_decay: float = 0.9
+    chunk: int = 1 << 18
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        rules: dict[str, tuple[bool, str]] = {
+            "cubes": (self.cubes >= 0, ">= 0"),
+            "visibility_samples": (self.visibility_samples >= 0, ">= 0"),
+            "min_views": (self.min_views >= 1, ">= 1"),
+            "chunk": (self.chunk >= 1, ">= 1"),
+            "seed": (self.seed >= 0, ">= 0"),
+            "dsds_weight": (math.isfinite(self.dsds_weight) and self.dsds_weight >= 0, "finite and >= 0"),
+            "visibility_weight": (
+                math.isfinite(self.visibility_weight) and self.visibility_weight >= 0, "finite and >= 0",
+            ),
+            "visibility_reach": (
+                math.isfinite(self.visibility_reach) and self.visibility_reach >= 1, "finite and >= 1",
+            ),
+            "uniform_share": (0.0 <= self.uniform_share <= 1.0, "in [0, 1]"),
+            "strategy": (self.strategy in ("mixed", "importance", "uniform"), "mixed, importance or uniform"),
+            "visibility_kind": (self.visibility_kind in ("mixed", "rays", "uniform"), "mixed, rays or uniform"),
+            "edge_range": (self.edge_range is None or _is_range(self.edge_range), "0 < low <= high, finite"),
+            "threshold": (self.threshold is None or -1 <= self.threshold <= 1, "in [-1, 1]"),
+            "fill_threshold": (self.fill_threshold is None or -1 <= self.fill_threshold <= 1, "in [-1, 1]"),
+        }  # fmt: skip
+        for name, (holds, rule) in rules.items():
+            if not holds:
+                raise ValueError(f"DensityRegularizer: {name} must be {rule}, got {getattr(self, name)!r}")
+        if self.timestep is not None and not callable(self.timestep):
+            check_timestep(self.timestep, caller="DensityRegularizer")
+
+
+def _is_range(edge_range: tuple[float, float]) -> bool:
+    return len(edge_range) == 2 and 0 < edge_range[0] <= edge_range[1] and math.isfinite(edge_range[1])

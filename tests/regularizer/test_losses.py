@@ -1,0 +1,100 @@
+import pytest
+import torch
+
+from unghost.regularizer.losses import dsds_loss, stable_mean, visibility_loss
+
+
+def test_dsds_by_hand_both_halves_alive():
+    density = torch.tensor([[3.0, 0.5], [0.5, 3.0]], requires_grad=True)
+    x0_pred = torch.tensor([[-0.2, -1.0], [0.0, 0.9]])
+    loss = dsds_loss(density, x0_pred, target_density=2.0)
+    # empty: the density itself; occupied (0 counts as occupied): 2 - 0.5 = 1.5, and nothing above w
+    assert loss.tolist() == [[3.0, 0.5], [1.5, 0.0]]
+    loss.sum().backward()
+    assert density.grad.tolist() == [[1.0, 1.0], [-1.0, 0.0]]
+
+
+def test_dsds_leaves_the_undecided_alone():
+    density = torch.tensor([1.0, 1.0, 1.0], requires_grad=True)
+    loss = dsds_loss(density, torch.tensor([-0.6, -0.1, 0.4]), target_density=4.0, threshold=-0.5, fill_threshold=0.0)
+    assert loss.tolist() == [1.0, 0.0, 3.0]
+    loss.sum().backward()
+    assert density.grad.tolist() == [1.0, 0.0, -1.0]
+
+
+def test_dsds_per_cube_target_and_no_gradient_to_the_prediction():
+    density = torch.zeros(2, 3, requires_grad=True)
+    x0_pred = torch.ones(2, 3, requires_grad=True)
+    loss = dsds_loss(density, x0_pred, target_density=torch.tensor([[1.0], [2.0]]))
+    assert loss.tolist() == [[1.0] * 3, [2.0] * 3]
+    loss.sum().backward()
+    assert x0_pred.grad is None
+
+
+@pytest.mark.parametrize("threshold", [0.0, -0.3])
+def test_gradcheck(threshold):
+    generator = torch.Generator().manual_seed(0)
+    density = (torch.rand(3, 2, 2, 2, generator=generator, dtype=torch.float64) * 2 + 0.05).requires_grad_()
+    x0_pred = torch.rand(3, 2, 2, 2, generator=generator, dtype=torch.float64) * 2 - 1
+    assert torch.autograd.gradcheck(
+        lambda d: dsds_loss(d, x0_pred, target_density=1.0, threshold=threshold, fill_threshold=0.1), (density,)
+    )
+    views = torch.randint(0, 3, density.shape, generator=generator)
+    assert torch.autograd.gradcheck(lambda d: visibility_loss(d, views, min_views=2), (density,))
+
+
+def test_visibility_by_hand():
+    density = torch.tensor([2.0, 3.0, 5.0])
+    assert visibility_loss(density, torch.tensor([0, 1, 2])).tolist() == [2.0, 0.0, 0.0]
+    assert visibility_loss(density, torch.tensor([0, 1, 2]), min_views=2).tolist() == [2.0, 3.0, 0.0]
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_is_upcast(dtype):
+    density = torch.full((4,), 60000.0 if dtype is torch.float16 else 1e30, dtype=dtype, requires_grad=True)
+    loss = dsds_loss(density, -torch.ones(4), target_density=0.01)
+    assert loss.dtype is torch.float32
+    total = stable_mean(loss)
+    assert torch.isfinite(total)
+    total.backward()
+    assert density.grad.dtype is dtype
+    assert density.grad.tolist() == [0.25] * 4
+
+
+def test_sums_of_huge_densities_do_not_overflow():
+    density = torch.full((64,), 3e38, requires_grad=True)
+    assert torch.isinf(dsds_loss(density, -torch.ones(64), target_density=1.0).sum())  # the naive reduction does
+    total = stable_mean(dsds_loss(density, -torch.ones(64), target_density=1.0))
+    assert total.item() == pytest.approx(3e38, rel=1e-6)
+    total.backward()
+    assert torch.isfinite(density.grad).all()
+
+
+def test_huge_and_occupied_is_no_loss_and_no_nan():
+    density = torch.tensor([1e30, 3e38], requires_grad=True)
+    loss = dsds_loss(density, torch.ones(2), target_density=1.0)
+    assert loss.tolist() == [0.0, 0.0]
+    loss.sum().backward()
+    assert density.grad.tolist() == [0.0, 0.0]
+
+
+def test_stable_mean_of_nothing_is_zero():
+    assert stable_mean(torch.zeros(0)).item() == 0.0
+
+
+def test_errors_name_function_and_argument():
+    density = torch.ones(4)
+    with pytest.raises(ValueError, match=r"dsds_loss: x0_pred must have shape \(4,\), got \(4, 4\)"):
+        dsds_loss(density, torch.ones(4, 4), target_density=1.0)
+    with pytest.raises(ValueError, match="target_density must be finite"):
+        dsds_loss(density, density, target_density=float("nan"))
+    with pytest.raises(ValueError, match="target_density must be a number or have shape"):
+        dsds_loss(torch.ones(4, 4), torch.ones(4, 4), target_density=torch.ones(1, 4))
+    with pytest.raises(ValueError, match="fill_threshold must be finite and >= threshold"):
+        dsds_loss(density, density, target_density=1.0, threshold=0.5, fill_threshold=0.0)
+    with pytest.raises(ValueError, match="view_count must have shape"):
+        visibility_loss(density, torch.ones(3))
+    with pytest.raises(ValueError, match="min_views"):
+        visibility_loss(density, torch.ones(4), min_views=0)
+    with pytest.raises(TypeError, match="floating-point"):
+        dsds_loss(torch.ones(4, dtype=torch.int64), density, target_density=1.0)
