@@ -1,0 +1,255 @@
+"""A real capture: does the prior take ghosts out of a field that was trained on one sweep of photos?
+
+    python benchmarks/capture.py CAPTURE --train trajectory_1 --eval trajectory_3
+
+A field is fitted to the training sweep, a pseudo-ground-truth field to both. The first is then
+fine-tuned with (a) nothing more, (b) the visibility loss, (c) visibility and DSDS, for the same steps
+from the same seed, and each is scored on the evaluation sweep (``evaluation/protocol.py``). Writes
+``capture.json`` and ``capture.png``. Fitted fields and renderings are kept in ``--cache``, so that a
+run can be broken off and resumed, and other regularizer settings cost their own fine-tuning only.
+"""
+
+from __future__ import annotations
+
+import ast
+import copy
+import dataclasses
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from fit_cache import FitCache, Plan, code_hash, file_hash, say
+from numpy.typing import NDArray
+
+import unghost.fields
+import unghost.regularizer
+from unghost import load_denoiser
+from unghost.core.cameras import Cameras
+from unghost.core.results import build_results, write_results
+from unghost.evaluation import protocol
+from unghost.evaluation.captures import load_capture
+from unghost.evaluation.report import draw_comparison, format_table, mean_over_seeds
+from unghost.fields.radiance import RadianceConfig, RadianceField
+from unghost.fields.rendering import render_view
+from unghost.fields.training import train_field
+from unghost.regularizer.regularizer import DensityRegularizer
+from unghost.regularizer.settings import RegularizerSettings
+
+ROOT = Path(__file__).resolve().parents[1]
+METHODS = {"field": "(a) fine-tuned alone", "visibility": "(b) + visibility", "dsds": "(c) + visibility + DSDS"}
+FIGURE_VIEWS = 4
+Views = dict[str, NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to compare.
+
+    Attributes:
+        capture: folder with transforms.json, splits.json and the photos.
+        train: the sweep to train on.
+        eval: the sweep to be scored on.
+        seeds: one run each; the table shows their mean.
+        downscale: photo pixels per rendered pixel, along each axis.
+        seconds: wall time of fitting each field (so a faster machine gets a better field; see steps).
+        steps: fit for so many steps instead.
+        finetune_steps: of each of (a), (b), (c).
+        resolution: density nodes of the field along an axis (.8 of it for colour); the field's defaults if left out.
+        denoiser: a shipped name or the path of an .onnx or .safetensors file.
+        settings: of the regularizer, as name=value, e.g. dsds_weight=0.2 cubes=20.
+        out: where capture.json and capture.png go.
+        cache: where fitted fields and renderings are kept; remove it to start over.
+    """
+
+    capture: tyro.conf.Positional[Path]
+    train: str
+    eval: str
+    seeds: tuple[int, ...] = (0, 1, 2)
+    downscale: float = 8
+    seconds: float = 360.0
+    steps: int | None = None
+    finetune_steps: int = 300
+    resolution: int | None = None
+    denoiser: str = "default"
+    settings: tuple[str, ...] = ()
+    out: Path = ROOT / "docs" / "results"
+    cache: Path = ROOT / "out" / "capture"
+
+    def command(self) -> str:
+        """The command that asks for the same numbers, without anybody's paths."""
+        seeds = " ".join(map(str, self.seeds))
+        parts = [f"python benchmarks/capture.py {self.capture.resolve().name} --train {self.train} --eval {self.eval}"]
+        parts += [f"--seeds {seeds} --downscale {self.downscale:g} --finetune-steps {self.finetune_steps}"]
+        parts += [f"--seconds {self.seconds:g}" if self.steps is None else f"--steps {self.steps}"]
+        parts += [f"--resolution {self.resolution}"] if self.resolution else []
+        parts += [f"--denoiser {Path(self.denoiser).name}"] if self.denoiser != "default" else []
+        return " ".join([*parts, *(["--settings", *self.settings] if self.settings else [])])
+
+    def overrides(self) -> dict[str, Any]:
+        """``settings`` as keyword arguments."""
+        pairs = [text.partition("=") for text in self.settings]
+        known = {item.name for item in dataclasses.fields(RegularizerSettings)} - {"seed", "rule"}
+        for (name, sign, _), text in zip(pairs, self.settings):
+            if not sign or name not in known:
+                raise ValueError(f"--settings: {text!r} is not name=value with a name of {', '.join(sorted(known))}")
+        return {name: _literal(value) for name, _, value in pairs}
+
+
+def _literal(text: str) -> Any:
+    try:
+        return ast.literal_eval(text)
+    except (ValueError, SyntaxError):
+        return text
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Cameras and photos ``(n, H, W, 3)``."""
+
+    cameras: Cameras
+    photos: NDArray[np.float32]
+
+    def digest(self) -> str:
+        """Of every pixel and every number of the cameras."""
+        arrays = (self.photos, self.cameras.camera_to_world, self.cameras.intrinsics, self.cameras.distortion)
+        return hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).hexdigest()
+
+
+def render(field: RadianceField, cameras: Cameras) -> Views:
+    """All views: ``rgb (n, H, W, 3)``, ``depth (n, H, W)``."""
+    views = [render_view(field, cameras, index) for index in range(len(cameras))]
+    return {key: protocol.stack(views, key) for key in ("rgb", "depth")}
+
+
+def fit_field(options: Options, cache: FitCache, name: str, sweep: Sweep, seed: int) -> tuple[RadianceField, Any]:
+    """A field fitted to a sweep, and its record."""
+    grids = {"resolution": options.resolution, "color_resolution": round(0.8 * (options.resolution or 0))}
+    config = RadianceConfig(**(grids if options.resolution else {}))
+    budget = {"seconds": options.seconds} if options.steps is None else {"steps": options.steps}
+    key = {"photos": sweep.digest(), "seed": seed, "budget": budget}
+
+    def fit(field: RadianceField) -> dict[str, Any]:
+        record = train_field(field, sweep.cameras, sweep.photos, seed=seed, progress=True, **budget)
+        error = np.mean((render(field, sweep.cameras)["rgb"] - sweep.photos) ** 2, axis=(1, 2, 3))
+        return {**record, "own_photos_psnr": float(np.mean(-10 * np.log10(error)))}
+
+    return cache.field(f"{name}-{seed}", key, config, fit)
+
+
+def fine_tune(
+    options: Options, base: RadianceField, train: Sweep, evaluation: Sweep, seed: int, method: str, denoiser: Any
+) -> Views:
+    """Renderings of a copy of ``base`` after fine-tuning it by one of ``METHODS``, and the seconds it took."""
+    field = copy.deepcopy(base)
+    hooks: dict[str, Any] = {}
+    if method != "field":
+        overrides = {**options.overrides(), **({"dsds_weight": 0.0} if method == "visibility" else {})}
+        regularizer = DensityRegularizer(
+            denoiser, aabb=field.aabb, cameras=train.cameras, field_pitch=field.field_pitch, seed=seed, **overrides
+        )
+        hooks = {
+            "regularizer": lambda tuned, step: sum(regularizer(tuned.density_fn).values()),
+            "observer": regularizer.observe,
+        }
+    record = train_field(
+        field, train.cameras, train.photos, steps=options.finetune_steps, seed=seed, fine_tune=True, progress=True,
+        **hooks,
+    )  # fmt: skip
+    return {**render(field, evaluation.cameras), "seconds": np.array(record["seconds"])}
+
+
+def score_seed(seed: int, tuned: dict[str, Views], sweep: Sweep, pseudo: Any, visible: Any, limit: float) -> dict:
+    """Scores of every method of one seed, on its own pixels and on those that all have."""
+    shared = protocol.common_mask([visible & protocol.depth_masks(views["depth"], limit) for views in tuned.values()])
+    scores = {}
+    for method, views in tuned.items():
+        rendered = [{"rgb": rgb, "depth": depth} for rgb, depth in zip(views["rgb"], views["depth"])]
+        found = protocol.score(
+            rendered, sweep.photos, pseudo, sweep.cameras, visible=visible, limit=limit, common=shared
+        )
+        scores[method] = {"seed": seed, **found, "seconds": float(views["seconds"])}
+    return scores
+
+
+def run(options: Options) -> dict[str, Any]:
+    """Do it all; returns the results object."""
+    overrides = options.overrides()
+    capture = load_capture(options.capture, downscale=options.downscale)
+    indices = [capture.split(name) for name in (options.train, options.eval)]
+    if set(indices[0]) & set(indices[1]):
+        raise ValueError(f"--train {options.train} and --eval {options.eval} share photos")
+    train, evaluation, both = (
+        Sweep(capture.cameras.select(chosen), capture.images(chosen)) for chosen in (*indices, np.concatenate(indices))
+    )
+    denoiser = load_denoiser(options.denoiser)
+    weights = {"name": denoiser.manifest.name, "sha256": denoiser.manifest.body_sha256 or file_hash(options.denoiser)}
+    cache = FitCache(options.cache)
+    fits, tunes = 1 + len(options.seeds), len(options.seeds) * len(METHODS)
+    guess = options.seconds if options.steps is None else options.steps * 0.3
+    plan = Plan(["fit"] * fits + ["tune"] * tunes, {"fit": guess, "tune": options.finetune_steps * 0.5})
+
+    plan.begin("fit", f"pseudo ground truth: {len(both.cameras)} photos of both sweeps")
+    pseudo_field, pseudo_record = fit_field(options, cache, "pseudo", both, 0)
+    code = code_hash(unghost.fields)
+    pseudo_views = cache.views(
+        "pseudo", {"field": pseudo_record["sha256"], "code": code, "eval": evaluation.digest()},
+        lambda: render(pseudo_field, evaluation.cameras),
+    )  # fmt: skip
+    limit = protocol.depth_limit(train.cameras, evaluation.cameras)
+    visible = protocol.visibility_masks(evaluation.cameras, pseudo_views["depth"], train.cameras)
+
+    records, per_seed, shown = [], [], {}
+    for seed in options.seeds:
+        plan.begin("fit", f"field, seed {seed}: {len(train.cameras)} photos of {options.train}")
+        base, record = fit_field(options, cache, "field", train, seed)
+        records.append({"seed": seed, **record})
+        tuned = {}
+        for method, heading in METHODS.items():
+            plan.begin("tune", f"seed {seed}, {heading}")
+            recipe = {} if method == "field" else {**overrides, "code": code_hash(unghost.regularizer)}
+            recipe.update(weights if method == "dsds" else {})
+            tuning = {"steps": options.finetune_steps, "code": code, "regularizer": recipe}
+            tuned[method] = cache.views(
+                f"{method}-{seed}", {"field": record["sha256"], "eval": evaluation.digest(), **tuning},
+                lambda base=base, seed=seed, method=method: fine_tune(
+                    options, base, train, evaluation, seed, method, denoiser
+                ),
+            )  # fmt: skip
+        shown = shown or tuned
+        per_seed.append(score_seed(seed, tuned, evaluation, pseudo_views["depth"], visible, limit))
+    rows = [mean_over_seeds(method, [scores[method] for scores in per_seed]) for method in METHODS]
+    results = build_results(
+        rows, command=options.command(), seeds=options.seeds, capture=capture.folder.resolve().name, prior=weights,
+        regularizer={k: v for k, v in dataclasses.asdict(RegularizerSettings(**overrides)).items() if k != "seed"},
+        depth_limit=limit, visible_share=float(visible.mean()), fields=records, pseudo_ground_truth=pseudo_record,
+    )  # fmt: skip
+    write_results(options.out / "capture.json", protocol.json_ready(results))
+    draw(options, {"photo · pseudo depth": {"rgb": evaluation.photos, "depth": pseudo_views["depth"]},
+                   **{METHODS[method]: views for method, views in shown.items()}}, limit, rows)  # fmt: skip
+    return results
+
+
+def draw(options: Options, columns: dict[str, Views], limit: float, rows: list[dict[str, Any]]) -> None:
+    count = len(next(iter(columns.values()))["depth"])
+    views = np.unique(np.linspace(0, count - 1, FIGURE_VIEWS + 2).round().astype(int)[1:-1]).tolist()
+    numbers = " · ".join(f"{row['method']} {row['psnr'] or 0:.2f} dB at {row['coverage']:.3f}" for row in rows)
+    draw_comparison(
+        options.out / "capture.png", columns, views=views, limit=limit,
+        title=f"{options.capture.resolve().name}: trained on {options.train}, seen from {options.eval}",
+        note=f"Below each picture its depth (warm is near; grey: nothing within the depth limit). Pictures: seed "
+        f"{options.seeds[0]}. Masked PSNR at coverage, mean of {len(options.seeds)} seeds: {numbers}.",
+    )  # fmt: skip
+
+
+def main() -> None:
+    options = tyro.cli(Options, description=__doc__)
+    results = run(options)
+    say(format_table(results["rows"]))
+    say(f"{options.out / 'capture.json'} and capture.png")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,127 @@
+"""What long measurements share: fitted fields and renderings kept on disk, and a plan that says how long is left."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors.torch import load_file, save_file
+
+import unghost.fields
+from unghost.fields.radiance import RadianceConfig, RadianceField
+
+Views = dict[str, NDArray[Any]]
+
+
+def say(text: str) -> None:
+    """A line of progress, at once."""
+    print(text, flush=True)
+
+
+def file_hash(path: str | Path) -> str:
+    """SHA-256 of a file; ``unknown`` if there is none."""
+    source = Path(path)
+    return hashlib.sha256(source.read_bytes()).hexdigest() if source.is_file() else "unknown"
+
+
+def code_hash(*packages: Any) -> str:
+    """Of every module in the packages' folders."""
+    files = [file for package in packages for file in sorted(Path(package.__file__).parent.glob("*.py"))]
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:16]
+
+
+class FitCache:
+    """Fields and renderings under the hash of what made them; each is there whole or not at all."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def _path(self, name: str, key: dict[str, Any], suffix: str) -> Path:
+        digest = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:16]
+        return self.folder / f"{name}-{digest}{suffix}"
+
+    def field(
+        self, name: str, key: dict[str, Any], config: RadianceConfig, fit: Callable[[RadianceField], dict[str, Any]]
+    ) -> tuple[RadianceField, dict[str, Any]]:
+        """The field that ``fit`` made, and its record: what ``fit`` returned, ``code`` and ``sha256``.
+
+        Args:
+            name: for people.
+            key: all that the fit depends on besides ``config`` and the code. Code that has changed since
+                is told, and stands in the record, but does not discard hours of fitting.
+            config: of the field.
+            fit: trains the fresh field that it is given.
+        """
+        path = self._path(name, {**key, "config": dataclasses.asdict(config)}, ".safetensors")
+        field = RadianceField(config)
+        note = path.with_suffix(".json")
+        if note.exists():
+            record = json.loads(note.read_text(encoding="utf-8"))
+            state = load_file(path)
+            field.resample(*(round(len(state[table]) ** (1 / 3)) for table in ("density_table", "color_table")))
+            field.load_state_dict(state)
+            stale = "" if record["code"] == code_hash(unghost.fields) else " (fields/ has changed since)"
+            say(f"    from the cache{stale}")
+            return field, record
+        record = {**fit(field), "code": code_hash(unghost.fields)}
+        partial = path.with_suffix(".partial")
+        save_file({entry: value.detach().contiguous() for entry, value in field.state_dict().items()}, partial)
+        os.replace(partial, path)
+        record["sha256"] = file_hash(path)
+        partial.write_text(json.dumps(record), encoding="utf-8")
+        os.replace(partial, note)
+        return field, record
+
+    def views(self, name: str, key: dict[str, Any], make: Callable[[], Views]) -> Views:
+        """The arrays that ``make`` returned; ``key`` is all that they depend on, the code's hash included."""
+        path = self._path(name, key, ".npz")
+        if path.exists():
+            with np.load(path) as stored:
+                return dict(stored)
+        made = make()
+        partial = path.with_suffix(".partial")
+        with partial.open("wb") as stream:
+            np.savez(stream, **made)  # type: ignore[arg-type]
+        os.replace(partial, path)
+        return made
+
+
+class Plan:
+    """Says what is being done, and about how long the rest will take.
+
+    Args:
+        stages: kinds of stages, one entry for each that is to come.
+        guesses: seconds of each kind, until one has been timed.
+    """
+
+    def __init__(self, stages: Sequence[str], guesses: dict[str, float]) -> None:
+        self.left, self.total = list(stages), len(stages)
+        self.durations = {kind: [seconds] for kind, seconds in guesses.items()}
+        self.begun = self.now = time.perf_counter()
+        self.current: str | None = None
+
+    def begin(self, stage: str, what: str) -> None:
+        """Announce the next stage."""
+        self._learn()
+        rest = sum(float(np.mean(self.durations[each])) for each in self.left)
+        self.left.remove(stage)
+        self.current, self.now = stage, time.perf_counter()
+        so_far = (self.now - self.begun) / 60
+        say(
+            f"[{self.total - len(self.left)}/{self.total}] {what} · {so_far:.1f} min so far, about {rest / 60:.1f} left"
+        )
+
+    def _learn(self) -> None:
+        spent = time.perf_counter() - self.now
+        if self.current is not None and spent > 2.0:  # less: it came from the cache
+            timed = self.durations[self.current]
+            self.durations[self.current] = [spent] if len(timed) == 1 else [*timed[-2:], spent]

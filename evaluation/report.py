@@ -1,0 +1,140 @@
+"""From scores to a results row, a printed table and a comparison figure (needs matplotlib: ``unghost[eval]``)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .protocol import json_ready
+
+TABLE_KEYS = (
+    "psnr", "ssim", "depth_mse", "disparity_mae", "normal_mean_deg", "normal_median_deg", "normal_pct_30",
+    "coverage", "psnr_common", "psnr_visible",
+)  # fmt: skip
+
+
+def mean_over_seeds(method: str, per_seed: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """One results row: the mean of every number over the seeds, and each seed's own values under ``per_seed``.
+
+    A seed without a value (NaN) makes the mean None: half a mean is not comparable with a whole one.
+
+    Args:
+        method: the row's name.
+        per_seed: scores with the same keys, a ``seed`` and one ``convention``.
+
+    Raises:
+        ValueError: no seed, different keys, or scores of different conventions.
+    """
+    if not per_seed:
+        raise ValueError("mean_over_seeds: per_seed must hold at least one seed's scores")
+    keys = list(per_seed[0])
+    if any(set(scores) != set(keys) for scores in per_seed):
+        raise ValueError("mean_over_seeds: every seed must have the same keys")
+    conventions = {scores.get("convention") for scores in per_seed}
+    if len(conventions) > 1:
+        raise ValueError(
+            f"mean_over_seeds: scores of different conventions do not mix: {sorted(map(str, conventions))}"
+        )
+    row: dict[str, Any] = {"method": method}
+    for key in keys:
+        if key == "convention":
+            row[key] = per_seed[0][key]
+        elif key != "seed":
+            row[key] = float(np.mean([float(scores[key]) for scores in per_seed]))
+    row["per_seed"] = [{key: value for key, value in scores.items() if key != "convention"} for scores in per_seed]
+    return dict(json_ready(row))
+
+
+def format_table(rows: Sequence[Mapping[str, Any]], keys: Sequence[str] = TABLE_KEYS) -> str:
+    """Rows as aligned text, one method a line; a dash where there is no number.
+
+    Raises:
+        ValueError: rows of different conventions.
+    """
+    if len({row.get("convention") for row in rows}) > 1:
+        raise ValueError("format_table: rows of different conventions must not stand in one table")
+    cells = [["method", *keys]]
+    for row in rows:
+        values = [row.get(key) for key in keys]
+        cells.append([str(row["method"]), *["–" if value is None else f"{value:.3f}" for value in values]])
+    widths = [max(len(line[column]) for line in cells) for column in range(len(cells[0]))]
+    lines = ["  ".join(cell.rjust(width) for cell, width in zip(line, widths)).rstrip() for line in cells]
+    return "\n".join(lines)
+
+
+def draw_comparison(
+    path: str | Path,
+    columns: Mapping[str, Mapping[str, NDArray[Any]]],
+    *,
+    views: Sequence[int],
+    limit: float,
+    title: str,
+    note: str = "",
+) -> None:
+    """Draw colour over depth for some views, a column a method; two views side by side.
+
+    Args:
+        path: of the PNG.
+        columns: heading -> ``rgb (n, H, W, 3)`` in [0, 1] and ``depth (n, H, W)`` along unit rays. The
+            first column sets the range of depths of each view.
+        views: which of the ``n`` to show.
+        limit: depths from here on, infinite ones too, are drawn in grey.
+        title: above the picture.
+        note: below the picture.
+
+    Raises:
+        ImportError: matplotlib is missing.
+    """
+    try:
+        from matplotlib import colormaps
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ImportError("draw_comparison needs matplotlib: pip install unghost[eval]") from error
+    blocks = 2 if len(views) > 1 else 1
+    across = len(columns) * blocks
+    down = 2 * -(-len(views) // blocks)
+    height, width = next(iter(columns.values()))["depth"].shape[1:]
+    cell = 1.9
+    size = (cell * across + 0.6, cell * height / width * down + 1.0)
+    figure = Figure(figsize=size, facecolor="white")
+    FigureCanvasAgg(figure)
+    figure.text(0.012, 1 - 0.28 / size[1], title, fontsize=13, weight="bold", va="center", color="#222222")
+    figure.text(0.012, 0.17 / size[1], note, fontsize=8.5, va="center", color="#555555")
+    turbo = colormaps["turbo"]
+    for number, view in enumerate(views):
+        near, far = _depth_range(next(iter(columns.values()))["depth"][view], limit)
+        for column, (heading, maps) in enumerate(columns.items()):
+            left = 0.012 + (number % blocks * len(columns) + column) * (cell / size[0])
+            left += number % blocks * 0.25 / size[0]
+            for row, picture in enumerate((maps["rgb"][view], _paint(maps["depth"][view], near, far, limit, turbo))):
+                line = number // blocks * 2 + row
+                bottom = 1 - (0.72 + (line + 1) * cell * height / width) / size[1]
+                axes = figure.add_axes((left, bottom, 0.97 * cell / size[0], 0.97 * cell * height / width / size[1]))
+                axes.imshow(np.clip(picture, 0, 1), interpolation="nearest")
+                axes.set_axis_off()
+                if line == 0:
+                    axes.set_title(heading, fontsize=9.5, color="#222222", pad=3)
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110, format="png", metadata={"Software": None})
+
+
+def _depth_range(depth: NDArray[Any], limit: float) -> tuple[float, float]:
+    known = depth[depth < limit]
+    if not known.size:
+        return 0.0, limit
+    near, far = np.percentile(known, [2, 98])
+    return float(near), float(max(far, near + 1e-6))
+
+
+def _paint(depth: NDArray[Any], near: float, far: float, limit: float, colours: Any) -> NDArray[Any]:
+    """Near is warm, far is cold (by inverse distance), nothing is grey."""
+    shown = depth < limit
+    inverse = 1.0 / np.clip(np.where(shown, depth, far), 1e-6, None)
+    spread = max(1.0 / max(near, 1e-6) - 1.0 / far, 1e-9)
+    painted: NDArray[Any] = colours(np.clip((inverse - 1.0 / far) / spread, 0, 1))[..., :3]
+    return np.where(shown[..., None], painted, 0.55)
