@@ -1,0 +1,53 @@
+import json
+import os
+
+import pytest
+
+from unghost.core import results
+
+
+def test_shape_of_the_object():
+    built = results.build_results([{"method": "clean", "iou": 0.5}], command="c", seeds=(0, 1), weights="abc")
+    assert list(built) == ["command", "commit", "versions", "machine", "seeds", "weights", "rows"]
+    assert built["rows"] == [{"method": "clean", "iou": 0.5}]
+    assert set(built["machine"]) == {"architecture", "system", "cores"}  # nothing that names the host
+    assert "numpy" in built["versions"]
+
+
+def test_every_row_needs_a_method():
+    with pytest.raises(ValueError, match="every row needs a 'method', got keys \\['iou'\\]"):
+        results.build_results([{"iou": 1}])
+
+
+def test_write_makes_folders_and_leaves_no_partial(tmp_path):
+    path = tmp_path / "a" / "b.json"
+    results.write_results(path, {"rows": [], "nothing": None})
+    assert json.loads(path.read_text(encoding="utf-8")) == {"rows": [], "nothing": None}
+    assert [item.name for item in path.parent.iterdir()] == ["b.json"]
+
+
+@pytest.mark.parametrize("bad", [{"x": float("nan")}, {"x": object()}])
+def test_a_failed_write_leaves_the_old_file(tmp_path, bad):
+    path = tmp_path / "r.json"
+    results.write_results(path, {"rows": [1]})
+    with pytest.raises((ValueError, TypeError)):
+        results.write_results(path, bad)
+    assert json.loads(path.read_text(encoding="utf-8")) == {"rows": [1]}
+
+
+def test_an_interrupted_write_leaves_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "r.json"
+    results.write_results(path, {"rows": [1]})
+
+    def killed(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "replace", killed)
+    with pytest.raises(KeyboardInterrupt):
+        results.write_results(path, {"rows": [2]})
+    assert json.loads(path.read_text(encoding="utf-8")) == {"rows": [1]}
+
+
+def test_commit_is_unknown_without_git(monkeypatch):
+    monkeypatch.setenv("PATH", "")
+    assert results.commit() == "unknown"
