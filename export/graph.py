@@ -28,7 +28,7 @@ class GraphBuilder:
         """An initialiser; equal constants are stored once."""
         import onnx.numpy_helper
 
-        array = np.ascontiguousarray(np.asarray(values, dtype=dtype))
+        array: NDArray[Any] = np.ascontiguousarray(np.asarray(values, dtype=dtype))
         key = (array.dtype.str, array.shape, array.tobytes())
         if key not in self._constants:
             self._constants[key] = f"constant_{len(self._constants)}"

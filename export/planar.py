@@ -72,7 +72,7 @@ def _up(graph: GraphBuilder, value: str, weight: Weights, bias: Weights) -> str:
     As one transposed convolution, for which onnxruntime needs half the time of ``Conv`` and ``DepthToSpace``.
     """
     channels = weight.shape[1]
-    kernel = weight.reshape(-1, 2, 2, 2, channels).transpose(4, 1, 0, 2, 3)  # (in, dz, out, dy, dx)
+    kernel = weight.reshape(2, 2, 2, -1, channels).transpose(4, 0, 3, 1, 2)  # (in, dz, out, dy, dx)
     inputs = [value, graph.constant(kernel.reshape(channels, -1, 2, 2)), graph.constant(np.tile(bias, 2))]
     return graph.node("ConvTranspose", *inputs, kernel_shape=[2, 2], strides=[2, 2])
 

@@ -1,0 +1,146 @@
+"""Weights on disk (safetensors, nothing pickled) and as a denoiser."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..core.manifest import METADATA_KEY, Manifest
+from .network import NetworkConfig, RestorationNet
+
+CONFIG_KEY = "unghost_network"
+
+
+def write_tensors(path: str | Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
+    """Write a safetensors file, whole or not at all."""
+    try:
+        from safetensors.torch import save_file
+    except ImportError:
+        raise ImportError("write_tensors: needs safetensors: pip install unghost[torch]") from None
+    target = Path(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    partial = target.with_name(target.name + ".partial")
+    save_file({name: value.detach().cpu().contiguous() for name, value in tensors.items()}, partial, dict(metadata))
+    with partial.open("rb+") as stream:
+        os.fsync(stream.fileno())
+    os.replace(partial, target)
+
+
+def read_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Tensors and metadata of a safetensors file.
+
+    Raises:
+        ValueError: missing, truncated, or another kind of file.
+    """
+    try:
+        from safetensors import SafetensorError, safe_open
+    except ImportError:
+        raise ImportError("read_tensors: needs safetensors: pip install unghost[torch]") from None
+    source = Path(path)
+    if not source.is_file():
+        raise ValueError(f"read_tensors: {source} does not exist or is not a file")
+    try:
+        with safe_open(source, framework="pt") as opened:
+            metadata = dict(opened.metadata() or {})
+            return {name: opened.get_tensor(name) for name in opened.keys()}, metadata  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise ValueError(f"read_tensors: {source} is truncated or not a safetensors file ({error})") from None
+
+
+class TorchDenoiser:
+    """A network as a denoiser: evaluation mode, no gradient, tensors in and out, on the network's device."""
+
+    kind = "torch"
+
+    def __init__(self, network: RestorationNet, manifest: Manifest) -> None:
+        if len(manifest.channels) != network.config.channels:
+            raise ValueError(
+                f"TorchDenoiser: the manifest names {len(manifest.channels)} channels, "
+                f"the network takes {network.config.channels}"
+            )
+        self.network = network.eval().requires_grad_(False)
+        self.manifest = manifest
+
+    def to(self, device: torch.device | str) -> TorchDenoiser:
+        """The same denoiser, its weights moved to ``device``."""
+        self.network.to(device)
+        return self
+
+    @torch.no_grad()
+    def __call__(self, channels: Tensor, timestep: Any, edge_fraction: Any) -> Tensor:
+        """Denoise.
+
+        Args:
+            channels: ``(N, C, 32, 32, 32)`` in [-1, 1].
+            timestep: ``(N,)`` integers in [0, 1000), or one for all.
+            edge_fraction: ``(N,)`` > 0, or one for all.
+
+        Returns:
+            ``x0_pred (N, 1, 32, 32, 32)`` float32 in [-1, 1], on the device of ``channels``.
+        """
+        device = self.network.gain.device
+        count = (len(channels),)
+        times = torch.as_tensor(timestep, device=device)
+        if times.is_floating_point() or times.dtype == torch.bool:
+            raise TypeError(f"TorchDenoiser: timestep must be an integer, got dtype {times.dtype}")
+        if bool(((times < 0) | (times >= 1000)).any()):
+            raise ValueError(f"TorchDenoiser: timestep must lie in [0, 1000), got {times.min()} .. {times.max()}")
+        edges = torch.as_tensor(edge_fraction, device=device, dtype=torch.float32)
+        if not bool((torch.isfinite(edges) & (edges > 0)).all()):
+            raise ValueError("TorchDenoiser: edge_fraction must be finite and > 0")
+        times = times.expand(count) if times.ndim == 0 else times
+        edges = edges.expand(count) if edges.ndim == 0 else edges
+        x0_pred: Tensor = self.network(channels.to(device, torch.float32), times, edges).to(channels.device)
+        return x0_pred
+
+
+def save_model(path: str | Path, network: RestorationNet, manifest: Manifest) -> None:
+    """Write weights, manifest and network configuration as one safetensors file, atomically."""
+    if len(manifest.channels) != network.config.channels:
+        raise ValueError(
+            f"save_model: the manifest names {len(manifest.channels)} channels, "
+            f"the network takes {network.config.channels}"
+        )
+    metadata = {METADATA_KEY: manifest.to_json(), CONFIG_KEY: json.dumps(network.config.to_dict(), sort_keys=True)}
+    write_tensors(path, network.state_dict(), metadata)
+
+
+def network_from_tensors(tensors: Mapping[str, Tensor], metadata: Mapping[str, str], *, origin: str) -> RestorationNet:
+    """Build the network that ``metadata`` describes and fill it; ``origin`` names the file in errors."""
+    if CONFIG_KEY not in metadata:
+        raise ValueError(f"{origin}: not an unghost checkpoint (its header has no {CONFIG_KEY!r})")
+    try:
+        config = NetworkConfig.from_dict(json.loads(metadata[CONFIG_KEY]))
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{origin}: its network configuration is not readable ({error})") from None
+    network = RestorationNet(config)
+    try:
+        network.load_state_dict(dict(tensors))
+    except RuntimeError as error:
+        raise ValueError(f"{origin}: its weights do not fit its configuration ({error})") from None
+    bad = [name for name, value in tensors.items() if not bool(torch.isfinite(value).all())]
+    if bad:
+        raise ValueError(f"{origin}: weights are not finite in {bad}")
+    return network
+
+
+def load_model(path: str | Path, *, device: torch.device | str = "cpu") -> TorchDenoiser:
+    """Read a file of :func:`save_model` as a denoiser.
+
+    Raises:
+        ValueError: missing, truncated or foreign file, or weights that do not fit.
+    """
+    tensors, metadata = read_tensors(path)
+    if METADATA_KEY not in metadata:
+        raise ValueError(f"load_model: {path} is not an unghost checkpoint (its header has no {METADATA_KEY!r})")
+    manifest = Manifest.from_json(metadata[METADATA_KEY], origin=str(path))
+    network = network_from_tensors(tensors, metadata, origin=str(path))
+    if len(manifest.channels) != network.config.channels:
+        raise ValueError(f"{path}: its manifest and its network disagree on the number of channels")
+    return TorchDenoiser(network.to(device), manifest)

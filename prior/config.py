@@ -1,0 +1,108 @@
+"""How to train: one frozen dataclass, dumped with every run."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from .network import NetworkConfig
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Everything that determines a run, shards aside.
+
+    Attributes:
+        name: of the model, for its manifest.
+        network: widths and depths.
+        seed: of the initial weights and of the stream of samples.
+        steps: optimiser steps; with ``max_seconds`` whichever is over first.
+        max_seconds: time budget, or None. The learning rate follows ``max(step / steps, elapsed / max_seconds)``,
+            so a run that ends by time ends with a decayed rate; only without it is a resumed run bit-exact.
+        batch_size: cubes a step.
+        learning_rate: peak, of AdamW.
+        final_rate: of the peak, at the end of the cosine.
+        weight_decay: on matrices and kernels, not on biases or the gain.
+        warmup_steps: of linear warm-up.
+        gradient_clip: largest norm of the gradient.
+        ema_decay: of the averaged weights, which are the ones kept.
+        interesting_weight: of voxels that are opaque, surface or beside such, in the loss.
+        precision: ``auto`` is bf16 where the processor multiplies it natively, else fp32.
+        device: as torch names it.
+        threads: of torch; 0 leaves it alone.
+        checkpoint_seconds: between checkpoints.
+        checkpoint_steps: the same in steps; 0 for by time only.
+        validate_seconds: between validations; 0 for at the end only.
+        validate_cubes: at most so many of each validation shard while training (all of them at the end).
+        default_timestep: of the manifest.
+        threshold_from: validation shard whose threshold at .98 of the surface kept goes to the manifest; "" for 0.
+        init_from: checkpoint (``model.safetensors``) to start from, or "".
+    """
+
+    name: str = "unghost-restoration"
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    seed: int = 0
+    steps: int = 30_000
+    max_seconds: float | None = None
+    batch_size: int = 48
+    learning_rate: float = 2e-3
+    final_rate: float = 0.01
+    weight_decay: float = 0.01
+    warmup_steps: int = 200
+    gradient_clip: float = 1.0
+    ema_decay: float = 0.999
+    interesting_weight: float = 4.0
+    precision: Literal["auto", "bf16", "fp32"] = "auto"
+    device: str = "cpu"
+    threads: int = 0
+    checkpoint_seconds: float = 120.0
+    checkpoint_steps: int = 0
+    validate_seconds: float = 300.0
+    validate_cubes: int = 512
+    default_timestep: int = 500
+    threshold_from: str = ""
+    init_from: str = ""
+
+    def __post_init__(self) -> None:
+        positive = ("steps", "batch_size", "learning_rate", "gradient_clip", "interesting_weight", "validate_cubes")
+        for name in (*positive, "checkpoint_seconds"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                raise ValueError(f"TrainConfig: {name} must be finite and > 0, got {value}")
+        for name in ("weight_decay", "warmup_steps", "final_rate", "threads", "checkpoint_steps", "validate_seconds"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0):
+                raise ValueError(f"TrainConfig: {name} must be finite and >= 0, got {value}")
+        if self.max_seconds is not None and not self.max_seconds > 0:
+            raise ValueError(f"TrainConfig: max_seconds must be > 0 or None, got {self.max_seconds}")
+        if not 0.0 <= self.ema_decay < 1.0:
+            raise ValueError(f"TrainConfig: ema_decay must lie in [0, 1), got {self.ema_decay}")
+        if self.precision not in ("auto", "bf16", "fp32"):
+            raise ValueError(f"TrainConfig: precision must be 'auto', 'bf16' or 'fp32', got {self.precision!r}")
+        if self.network.channels != 1:
+            raise ValueError(f"TrainConfig: shards hold one channel, network.channels is {self.network.channels}")
+
+    def to_json(self) -> str:
+        """One JSON object."""
+        return json.dumps(dataclasses.asdict(self), indent=1, sort_keys=True)
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> TrainConfig:
+        """From parsed JSON or TOML; unknown keys are refused."""
+        known = {item.name for item in dataclasses.fields(cls)}
+        if set(values) - known:
+            raise ValueError(f"TrainConfig: unknown keys {sorted(set(values) - known)}, known: {sorted(known)}")
+        body = dict(values)
+        if isinstance(body.get("network"), Mapping):
+            body["network"] = NetworkConfig.from_dict(body["network"])
+        return cls(**body)
+
+    def learning_rate_at(self, step: int, progress: float) -> float:
+        """Linear warm-up over ``warmup_steps``, then a cosine over ``progress`` in [0, 1] down to ``final_rate``."""
+        warm = min(1.0, (step + 1) / (self.warmup_steps + 1))
+        cosine = 0.5 * (1.0 + math.cos(math.pi * min(1.0, max(0.0, progress))))
+        return self.learning_rate * warm * (self.final_rate + (1.0 - self.final_rate) * cosine)

@@ -1,0 +1,221 @@
+"""Train a restoration prior from shards: checkpoints, validation, logs, a model at the end."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ..core.manifest import Manifest
+from ..core.results import commit, versions
+from ..core.shards import Shard, read_shard
+from .batches import Mixture
+from .checkpoint import TorchDenoiser, save_model
+from .config import TrainConfig
+from .evaluate import evaluate
+from .network import gflop, parameter_count
+from .trainer import Trainer
+
+MODEL_FILE, STATE_FILE, CONFIG_FILE, LOG_FILE = "model.safetensors", "state.safetensors", "config.json", "log.jsonl"
+
+
+@dataclass(frozen=True)
+class TrainResult:
+    """What a run left behind: the model's path, steps, seconds of training, why it ended, scores by shard."""
+
+    model: Path
+    steps: int
+    seconds: float
+    reason: str
+    validation: dict[str, dict[str, Any]]
+
+
+class _Log:
+    """JSON lines, and TensorBoard where it is installed."""
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / LOG_FILE
+        try:
+            from torch.utils.tensorboard import SummaryWriter
+        except ImportError:
+            self._board = None
+        else:
+            self._board = SummaryWriter(str(folder / "tensorboard"))
+
+    def scalars(self, step: int, values: Mapping[str, float]) -> None:
+        """To TensorBoard."""
+        if self._board is not None:
+            for name, value in values.items():
+                self._board.add_scalar(name, value, step)
+
+    def line(self, step: int, kind: str, values: Mapping[str, Any]) -> None:
+        """To the log file."""
+        with self._path.open("a", encoding="utf-8") as stream:
+            stream.write(json.dumps({"step": step, "kind": kind, **values}) + "\n")
+
+    def close(self) -> None:
+        if self._board is not None:
+            self._board.close()
+
+
+def _write_text(path: Path, text: str) -> None:
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(text + "\n", encoding="utf-8")
+    os.replace(partial, path)
+
+
+def _provenance(trainer: Trainer, shards: Sequence[tuple[str | Path, float]], mixture: Mixture) -> dict[str, Any]:
+    config = trainer.config
+    return {
+        "seed": config.seed, "steps": trainer.step, "seconds": round(trainer.elapsed, 1),
+        "batch_size": config.batch_size, "precision": "bf16" if trainer.bf16 else "fp32", "commit": commit(),
+        "torch": versions().get("torch", ""), "gflop": round(gflop(config.network), 4),
+        "shards": [
+            {"name": Path(path).name, "weight": weight, "cubes": len(shard)}
+            for (path, weight), shard in zip(shards, mixture.shards)
+        ],
+    }  # fmt: skip
+
+
+def _manifest(trainer: Trainer, training: dict[str, Any], threshold: float = 0.0) -> Manifest:
+    return Manifest(
+        name=trainer.config.name, default_timestep=trainer.config.default_timestep, removal_threshold=threshold,
+        parameters=parameter_count(trainer.network), training=training,
+    )  # fmt: skip
+
+
+def _validate(trainer: Trainer, shards: Mapping[str, Shard], limit: int | None) -> dict[str, dict[str, Any]]:
+    denoiser = TorchDenoiser(trainer.averaged_network(), _manifest(trainer, {}))
+    with torch.autocast(trainer.device.type, dtype=torch.bfloat16, enabled=trainer.bf16):
+        return {name: evaluate(denoiser, shard, limit=limit) for name, shard in shards.items()}
+
+
+def _log_validation(log: _Log, step: int, scores: Mapping[str, Mapping[str, Any]]) -> None:
+    for name, row in scores.items():
+        log.line(step, "validation", {"shard": name, **row})
+        flat = {f"{name}/{key}": value for key, value in row.items() if isinstance(value, float)}
+        log.scalars(step, flat)
+
+
+def _finish(
+    trainer: Trainer, out: Path, training: dict[str, Any], validation: Mapping[str, Shard]
+) -> dict[str, dict[str, Any]]:
+    """Score the averaged weights on all validation cubes and write the model with what was found."""
+    scores = _validate(trainer, validation, None)
+    chosen = scores.get(trainer.config.threshold_from, {}).get("threshold_98")
+    headline = {
+        name: {key: row[key] for key in ("cubes", "iou_before", "iou", "iou_clean", "ghosts_removed_98")}
+        for name, row in scores.items()
+    }
+    manifest = _manifest(trainer, training | {"validation": headline}, 0.0 if chosen is None else chosen)
+    save_model(out / MODEL_FILE, trainer.averaged_network(), manifest)
+    _write_text(out / "validation.json", json.dumps(scores, indent=1))
+    return scores
+
+
+def _prepare(config: TrainConfig, out: Path, resume: bool) -> Trainer:
+    """A trainer, fresh or restored; the configuration is on disk before the first step."""
+    state = out / STATE_FILE
+    if state.exists() and not resume:
+        raise FileExistsError(f"train: {out} holds a run already; resume it, or name another folder")
+    out.mkdir(parents=True, exist_ok=True)
+    _write_text(out / CONFIG_FILE, config.to_json())
+    trainer = Trainer(config)
+    if resume and state.exists():
+        trainer.restore(state)
+    return trainer
+
+
+def _run(
+    trainer: Trainer, mixture: Mixture, out: Path, log: _Log, validation: Mapping[str, Shard],
+    progress: bool, on_step: Callable[[int, Mapping[str, float]], None] | None,
+) -> str:  # fmt: skip
+    """Step until the budget is used; why it ended."""
+    from tqdm import tqdm
+
+    config = trainer.config
+    bar = tqdm(total=config.steps, initial=trainer.step, disable=not progress, unit="step", dynamic_ncols=True)
+    begun, carried = time.monotonic(), trainer.elapsed
+    first, saved, validated, shown = trainer.step, begun, begun, 0.0
+    batches = mixture.stream(trainer.step, config.batch_size)
+    try:
+        while trainer.progress < 1.0:
+            values = trainer.learn(next(batches))
+            now = time.monotonic()
+            trainer.elapsed = carried + now - begun
+            shown = values["loss"] if not shown else 0.98 * shown + 0.02 * values["loss"]
+            rate = (trainer.step - first) * config.batch_size / max(now - begun, 1e-9)
+            bar.update()
+            bar.set_postfix(loss=f"{shown:.4f}", cubes_per_second=f"{rate:.0f}", budget=f"{trainer.progress:.1%}")
+            if trainer.step % 20 == 0 or trainer.step == 1:
+                log.scalars(trainer.step, {f"train/{key}": value for key, value in values.items()})
+                log.line(trainer.step, "train", {**values, "seconds": round(trainer.elapsed, 1)})
+            due = config.checkpoint_steps and trainer.step % config.checkpoint_steps == 0
+            if due or now - saved > config.checkpoint_seconds:
+                trainer.save(out / STATE_FILE)
+                saved = time.monotonic()
+            if config.validate_seconds and validation and now - validated > config.validate_seconds:
+                _log_validation(log, trainer.step, _validate(trainer, validation, config.validate_cubes))
+                validated = time.monotonic()
+            if on_step is not None:
+                on_step(trainer.step, values)
+    finally:
+        batches.close()  # type: ignore[attr-defined]
+        bar.close()
+    return "steps" if trainer.step >= config.steps else "max_seconds"
+
+
+def train(
+    config: TrainConfig,
+    *,
+    train_shards: Sequence[tuple[str | Path, float]],
+    validation_shards: Mapping[str, str | Path] | None = None,
+    out: str | Path,
+    resume: bool = False,
+    progress: bool = True,
+    on_step: Callable[[int, Mapping[str, float]], None] | None = None,
+) -> TrainResult:
+    """Train, checkpoint, validate, and write ``out/model.safetensors`` (the averaged weights and a manifest).
+
+    Also written: ``config.json`` before the first step, ``state.safetensors`` (everything needed to go on),
+    ``log.jsonl``, ``tensorboard/``, ``validation.json``. On a CPU in fp32 with a budget of steps, a run that
+    was killed and resumed ends with the same bits as one that was not.
+
+    Args:
+        config: the run.
+        train_shards: folders of :func:`unghost.core.shards.write_shard` and their weights in the mixture.
+        validation_shards: name to folder; held out.
+        out: folder; must not hold a run unless ``resume``.
+        resume: go on from ``out/state.safetensors`` (from the start if there is none).
+        progress: a bar with loss, cubes per second and the part of the budget used.
+        on_step: called after each step with its number and ``loss, gradient_norm, learning_rate``.
+
+    Raises:
+        TrainingDiverged: loss or gradient not finite; the last checkpoint is kept.
+        FileExistsError: ``out`` holds a run and ``resume`` is False.
+        ValueError: an unreadable shard, an unknown ``threshold_from``.
+    """
+    named = dict(validation_shards or {})
+    if config.threshold_from and config.threshold_from not in named:
+        raise ValueError(f"train: threshold_from {config.threshold_from!r} is not among {sorted(named)}")
+    mixture = Mixture(train_shards, seed=config.seed)
+    validation = {name: read_shard(path) for name, path in named.items()}
+    if config.threads:
+        torch.set_num_threads(config.threads)
+    folder = Path(out)
+    trainer = _prepare(config, folder, resume)
+    log = _Log(folder)
+    try:
+        reason = _run(trainer, mixture, folder, log, validation, progress, on_step)
+        trainer.save(folder / STATE_FILE)
+        scores = _finish(trainer, folder, _provenance(trainer, train_shards, mixture), validation)
+        _log_validation(log, trainer.step, scores)
+    finally:
+        log.close()
+    return TrainResult(folder / MODEL_FILE, trainer.step, trainer.elapsed, reason, scores)
