@@ -30,12 +30,7 @@ _HOME = {
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module 'unghost' has no attribute {name!r}")
-    try:
-        value = getattr(import_module(_HOME[name], __name__), name)
-    except ModuleNotFoundError as error:
-        if error.name != "torch":
-            raise
-        raise ImportError(f"unghost.{name} needs torch: pip install 'unghost[torch]'") from error
+    value = getattr(import_module(_HOME[name], __name__), name)
     globals()[name] = value
     return value
 

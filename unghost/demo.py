@@ -34,12 +34,12 @@ class Outcome:
     seconds: float
 
 
-def _run_clean(room: Room) -> Mask:
-    keep_mask = clean(grid_density_fn(room.density, AABB), AABB, denoiser=load_denoiser(), field_pitch=room.pitch)
+def _run_clean(room: Room, denoiser: Any) -> Mask:
+    keep_mask = clean(grid_density_fn(room.density, AABB), AABB, denoiser=denoiser, field_pitch=room.pitch)
     return np.asarray(keep_mask.keep(cell_centers(AABB, SHAPE)))
 
 
-def _run_components(room: Room) -> Mask:
+def _run_components(room: Room, denoiser: Any) -> Mask:
     """Plain connected-component removal: of all that is occupied, keep the largest piece."""
     from scipy.ndimage import label
 
@@ -49,7 +49,7 @@ def _run_components(room: Room) -> Mask:
     return np.asarray(pieces == counts.argmax())
 
 
-METHODS: Mapping[str, Callable[[Room], Mask]] = {"clean": _run_clean, "components": _run_components}
+METHODS: Mapping[str, Callable[[Room, Any], Mask]] = {"clean": _run_clean, "components": _run_components}
 
 
 def _share(part: Mask, whole: Mask) -> float | None:
@@ -88,22 +88,23 @@ def score(room: Room, kept: Mask) -> dict[str, Any]:
     }
 
 
-def run_methods(room: Room) -> dict[str, Outcome]:
-    """Every method once, timed from the density callable to the mask (the model's loading included)."""
+def run_methods(room: Room, denoiser: Any) -> dict[str, Outcome]:
+    """Every method once, timed from the density callable to the mask."""
     outcomes = {}
     for name, method in METHODS.items():
         start = time.perf_counter()
-        kept = method(room)
+        kept = method(room, denoiser)
         outcomes[name] = Outcome(kept, time.perf_counter() - start)
     return outcomes
 
 
-def run_demo(out: str | Path, *, seed: int = 0) -> dict[str, Any]:
+def run_demo(out: str | Path, *, seed: int = 0, denoiser: Any = None) -> dict[str, Any]:
     """Build the room, clean it, score it, draw it.
 
     Args:
         out: folder for ``result.json`` and ``index.html`` (and the page's pictures as PNG); made if absent.
         seed: of the room and its ghosts, >= 0.
+        denoiser: the shipped one if None.
 
     Returns:
         The results object that was written.
@@ -113,13 +114,15 @@ def run_demo(out: str | Path, *, seed: int = 0) -> dict[str, Any]:
 
     folder = Path(out)
     start = time.perf_counter()
+    denoiser = load_denoiser() if denoiser is None else denoiser
     room = build_room(seed)
-    outcomes = run_methods(room)
+    outcomes = run_methods(room, denoiser)
     rows = [{"method": name, **score(room, item.kept), "seconds": item.seconds} for name, item in outcomes.items()]
     pictures = draw_pictures(room, {name: item.kept for name, item in outcomes.items()})
     results = build_results(
-        rows, command=f"unghost demo --seed {seed}", seeds=[seed], seconds=time.perf_counter() - start
-    )
+        rows, command=f"unghost demo --seed {seed}", seeds=[seed], seconds=time.perf_counter() - start,
+        weights={"name": denoiser.manifest.name, "body_sha256": denoiser.manifest.body_sha256},
+    )  # fmt: skip
     folder.mkdir(parents=True, exist_ok=True)
     for name, png in pictures.items():
         (folder / f"{name}.png").write_bytes(png)

@@ -68,7 +68,7 @@ def draw_sections(room: Room, kept: Mapping[str, Mask], rule: OccupancyRule) -> 
     states |= {LABELS.get(name, name): mask for name, mask in kept.items()}
     states["the truth"] = room.surface(rule)
     level, upright = round((0.55 - AABB[0, 2]) / room.pitch), round((-0.55 - AABB[0, 1]) / room.pitch)
-    cuts = {"level, .55 m up": np.s_[:, :, level], "upright, through the table": np.s_[:, upright, :]}
+    cuts = {"level": np.s_[:, :, level], "upright": np.s_[:, upright, :]}
     figure = Figure(figsize=(3.0 * len(states), 4.7), dpi=110, layout="constrained", facecolor="white")
     grid = figure.subplots(2, len(states), height_ratios=[2, 1])
     for column, (title, mask) in enumerate(states.items()):

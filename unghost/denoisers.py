@@ -24,7 +24,7 @@ def _load_torch(path: Path, threads: int | None) -> Denoiser:
     except ModuleNotFoundError as error:
         if error.name not in ("torch", "safetensors"):
             raise
-        raise ImportError(f"load_denoiser: backend 'torch' needs {error.name}: pip install 'unghost[torch]'") from error
+        raise ImportError(f"load_denoiser: backend 'torch' needs {error.name}: pip install unghost[torch]") from error
     if threads is not None:
         raise ValueError("load_denoiser: threads is for backend 'onnx'; torch takes torch.set_num_threads")
     return load_model(path)

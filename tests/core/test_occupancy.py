@@ -90,9 +90,7 @@ def test_impossible_rules_are_refused(kind, threshold):
 def test_bad_densities_are_counted_and_placed():
     density = np.array([1.0, -2.0, np.nan, np.inf, -0.5])
     places = np.arange(15.0).reshape(5, 3)
-    with pytest.raises(
-        ValueError, match=r"clean: .* 1 NaN, 1 infinite, 2 negative of 5; first -2.0 at \[3.0, 4"
-    ):
+    with pytest.raises(ValueError, match=r"clean: .* 1 NaN, 1 infinite, 2 negative of 5; first -2.0 at \[3.0, 4"):
         check_density(density, places, caller="clean")
     check_density(np.array([0.0, 1e30, 1e-310]), places[:3], caller="clean")
 

@@ -1,0 +1,95 @@
+"""What must work on the base install, with the heavy packages absent; and proof that the guard can fail."""
+
+import subprocess
+import sys
+import textwrap
+
+import pytest
+
+ABSENT = ("torch", "onnx", "onnxscript", "safetensors", "trimesh", "open3d", "scipy", "skimage", "matplotlib", "PIL")
+BLOCKER = f"""
+import sys
+
+class Blocker:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in {ABSENT!r}:
+            raise ModuleNotFoundError(f"No module named {{name!r}} (blocked)", name=name)
+        return None
+
+sys.meta_path.insert(0, Blocker())
+"""
+
+
+def run(program):
+    return subprocess.run(
+        [sys.executable, "-W", "error", "-c", BLOCKER + textwrap.dedent(program)],
+        capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
+
+
+def test_the_base_install_imports_and_has_a_cleaner():
+    done = run(
+        """
+        import importlib, pkgutil
+        import unghost, unghost.core
+        for module in pkgutil.iter_modules(unghost.core.__path__, "unghost.core."):
+            importlib.import_module(module.name)
+        import unghost.export.runtime
+        import unghost.cli, unghost.commands, unghost.grids
+        assert callable(unghost.clean) and callable(unghost.load_denoiser)
+        assert isinstance(unghost.KeepMask, type)
+        unghost.export.runtime.OnnxDenoiser
+        """
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_cleaning_runs_without_torch():
+    done = run(
+        """
+        import numpy as np, unghost
+
+        class Oracle:
+            kind, manifest = "numpy", None
+            def __call__(self, channels, timestep, edge_fraction):
+                return channels[:, :1]
+
+        from unghost.core.manifest import Manifest
+        Oracle.manifest = Manifest("oracle")
+        ball = lambda p: (np.linalg.norm(p, axis=-1) < 0.6) * 80.0
+        mask = unghost.clean(ball, [[-1, -1, -1], [1, 1, 1]], denoiser=Oracle(), resolution=32)
+        assert mask.keep(np.zeros((1, 3)))[0]
+        """
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_regularizer_names_its_extra():
+    done = run(
+        """
+        import unghost
+        try:
+            unghost.DensityRegularizer
+        except ImportError as error:
+            assert "pip install unghost[torch]" in str(error), error
+        else:
+            raise SystemExit("no error")
+        """
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("package", ["torch", "scipy.ndimage", "onnx", "unghost.prior.network"])
+def test_the_guard_can_fail(package):
+    done = run(f"import {package}")
+    assert done.returncode != 0
+    assert "(blocked)" in done.stderr
+
+
+def test_import_is_light():
+    done = subprocess.run(
+        [sys.executable, "-c", "import sys, unghost; print([n for n in ('numpy', 'torch', 'tyro', 'onnxruntime') "
+         "if n in sys.modules])"],
+        capture_output=True, text=True, timeout=60, check=True,
+    )  # fmt: skip
+    assert done.stdout.strip() == "[]"
