@@ -1,0 +1,250 @@
+"""Clean a trained field: ask it once on a grid, let the denoiser vote, say what to keep. numpy only, no gradient."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..core.aabb import as_aabb, scene_extent
+from ..core.manifest import Denoiser
+from ..core.occupancy import EMPTY, OccupancyRule, check_density
+from ..core.schedule import check_timestep
+from .decide import decide, removed_regions
+from .denoise import check_denoiser
+from .keep_mask import KeepMask, lattice_origin
+from .queries import CHUNK, Backend, Query, make_query
+from .windows import Progress, grow, shrink, vote
+
+Mask = NDArray[np.bool_]
+FloatGrid = NDArray[np.float32]
+
+DEFAULT_RESOLUTION = 128
+MOST_CELLS = 1 << 27
+
+
+@dataclass(frozen=True)
+class CleanSettings:
+    """How ``clean`` looks and decides.
+
+    Attributes:
+        field_pitch: side of the field's own cells, scene units; None if unknown: then the grid's.
+        resolution: cells along the longest side; None for the field's own pitch, or 128 if that is unknown.
+        rule: density to occupancy.
+        strength: in [0, 1]: 0 removes nothing, 0.5 is the denoiser's advised threshold, 1 removes all that is occupied.
+        level_weights: of the votes at the grid's own pitch, at twice that, at four times …; 0 skips a level.
+        overlap: of neighbouring windows, in [0, 1).
+        timestep: for the denoiser; None for its default.
+        soft: show the denoiser opacities rather than bits (opacity rule only).
+        faint: cells that are not occupied but hold more than this share of the rule's threshold are judged too; 1
+            leaves them alone. One is removed if voted empty and not next to an occupied cell that stays.
+        smallest: connected pieces that stay must have this many cells.
+        speck: fewer connected cells than this, voted empty on something that stays, are kept.
+        keep_boxes: ``(2, 3)`` boxes in which nothing is removed (thin or transparent things).
+        skip_empty: do not send windows in which nothing is to be judged; never changes the mask.
+        drop_invalid: show NaN, infinite and negative densities as empty, leave their cells alone and count them,
+            instead of raising.
+        backend: what the callable takes, ``"numpy"`` or ``"torch"``; None to find out.
+        chunk: most positions handed to the callable at once.
+    """
+
+    field_pitch: float | None = None
+    resolution: int | None = None
+    rule: OccupancyRule = dataclasses.field(default_factory=OccupancyRule)
+    strength: float = 0.5
+    level_weights: tuple[float, ...] = (1.0, 0.5)
+    overlap: float = 0.5
+    timestep: int | None = None
+    soft: bool = True
+    faint: float = 0.1
+    smallest: int = 27
+    speck: int = 8
+    keep_boxes: tuple[Any, ...] = ()
+    skip_empty: bool = True
+    drop_invalid: bool = False
+    backend: Backend | None = None
+    chunk: int = CHUNK
+
+    def __post_init__(self) -> None:
+        pitch, levels = self.field_pitch, self.level_weights
+        rules: dict[str, tuple[bool, str]] = {
+            "field_pitch": (pitch is None or (math.isfinite(pitch) and pitch > 0), "finite and > 0"),
+            "resolution": (self.resolution is None or self.resolution >= 1, ">= 1"),
+            "strength": (0.0 <= self.strength <= 1.0, "in [0, 1]"),
+            "level_weights": (
+                len(levels) > 0 and all(math.isfinite(w) and w >= 0 for w in levels) and sum(levels) > 0,
+                "finite, >= 0 and not all 0",
+            ),
+            "overlap": (0.0 <= self.overlap < 1.0, "in [0, 1)"),
+            "faint": (0.0 < self.faint <= 1.0, "in (0, 1]"),
+            "smallest": (self.smallest >= 0, ">= 0"),
+            "speck": (self.speck >= 0, ">= 0"),
+            "chunk": (self.chunk >= 1, ">= 1"),
+        }
+        for name, (holds, rule) in rules.items():
+            if not holds:
+                raise ValueError(f"clean: {name} must be {rule}, got {getattr(self, name)!r}")
+        if self.timestep is not None:
+            check_timestep(self.timestep, caller="clean")
+        boxes = tuple(as_aabb(box, caller="clean: keep_boxes").tolist() for box in self.keep_boxes)
+        object.__setattr__(self, "keep_boxes", boxes)
+
+
+@dataclass(frozen=True)
+class _Survey:
+    """The field on a grid, all ``(X, Y, Z)``: signed opacity, occupied cells, cells to judge, cells in the box."""
+
+    signed: FloatGrid
+    occupied: Mask
+    judged: Mask
+    protected: Mask
+    dropped: int
+
+
+def clean(
+    density_fn: Callable[[Any], Any],
+    aabb: ArrayLike,
+    *,
+    denoiser: Denoiser,
+    settings: CleanSettings | None = None,
+    progress: Progress | None = None,
+    **overrides: Any,
+) -> KeepMask:
+    """Find out which density of a field is a ghost.
+
+    The field is asked once, on a grid of cubic cells at its own pitch. Overlapping windows of that grid, and of
+    ones shrunk two times (the largest opacity of each block), go through the denoiser; a cell's score is the
+    weighted mean of all that was predicted for it, and ``strength`` says below which score it is voted empty.
+    Connected pieces then have the last word: see :func:`unghost.regularizer.decide.decide`.
+
+    Args:
+        density_fn: ``positions (M, 3) float32 -> density (M, 1) or (M,)`` >= 0 per scene unit; arrays or tensors.
+            Unless ``backend`` says which, a torch module (or a method of one) gets tensors; any other callable is
+            asked about one point with an array and, if that raises and torch is loaded, with a tensor.
+        aabb: ``(2, 3)`` scene units: where to clean; the rest is left as it is.
+        denoiser: of one channel, kind ``"numpy"`` or ``"torch"``.
+        settings: see :class:`CleanSettings`; ``overrides`` replace single ones (``field_pitch`` foremost).
+        progress: called with (windows done, windows in all), level by level.
+
+    Returns:
+        A :class:`KeepMask`. The field itself is not touched.
+
+    Raises:
+        ValueError: an impossible box; a grid of more than 2^27 cells; a density callable that returns the wrong
+            shape, or NaN, infinite or negative values.
+
+    Example:
+        >>> mask = clean(density_fn, aabb, denoiser=denoiser, field_pitch=0.02)  # doctest: +SKIP
+        >>> cleaned_fn = mask.apply(density_fn)  # doctest: +SKIP
+    """
+    known = {item.name for item in dataclasses.fields(CleanSettings)}
+    if set(overrides) - known:
+        raise TypeError(f"clean: unknown settings {sorted(set(overrides) - known)}; known are {sorted(known)}")
+    s = dataclasses.replace(settings or CleanSettings(), **overrides)
+    box = as_aabb(aabb, caller="clean")
+    check_denoiser(denoiser, caller="clean")
+    pitch, shape = grid_of(box, s)
+    query = make_query(density_fn, place=box.mean(axis=0), backend=s.backend, chunk=s.chunk, caller="clean")
+    survey = _survey(query, box, pitch, shape, s)
+    score, windows = _score(survey, denoiser, s, pitch / scene_extent(box), progress)
+    threshold = threshold_of(s.strength, denoiser.manifest.removal_threshold)
+    removed, faint = decide(
+        survey.occupied, survey.judged, score, threshold=threshold, smallest=s.smallest, speck=s.speck
+    ) if s.strength > 0 else (np.zeros(shape, bool), np.zeros(shape, bool))  # fmt: skip
+    removed, faint = removed & ~survey.protected, faint & ~survey.protected
+    regions, region_count = removed_regions(removed, score, lattice_origin(box, pitch, shape), pitch)
+    details = {
+        "occupied": int(survey.occupied.sum()), "removed": int(removed.sum()), "faint_removed": int(faint.sum()),
+        "dropped": survey.dropped, "windows": windows, "threshold": threshold, "denoiser": denoiser.manifest.name,
+        "settings": dataclasses.asdict(s), "region_count": region_count, "regions": regions,
+    }  # fmt: skip
+    return KeepMask(box, pitch, ~(removed | faint), details)
+
+
+def grid_of(aabb: NDArray[np.float64], settings: CleanSettings) -> tuple[float, tuple[int, int, int]]:
+    """Side and number of the grid's cells."""
+    sides = aabb[1] - aabb[0]
+    if settings.resolution is not None:
+        pitch = float(sides.max()) / settings.resolution
+    else:
+        pitch = settings.field_pitch or float(sides.max()) / DEFAULT_RESOLUTION
+    counts = np.maximum(np.ceil(sides / pitch - 1e-4), 1.0)
+    if counts.prod() > MOST_CELLS:
+        raise ValueError(
+            f"clean: aabb with sides {sides.tolist()} has {counts.prod():.3g} cells of side {pitch:g}, more than "
+            f"{MOST_CELLS}: pass a smaller box, a larger field_pitch, or a resolution"
+        )
+    x, y, z = (int(count) for count in counts)
+    return float(max(pitch, *(sides / counts))), (x, y, z)
+
+
+def threshold_of(strength: float, advised: float) -> float:
+    """Score below which a cell is voted empty: -1 at strength 0, ``advised`` at 0.5, just above 1 at 1."""
+    if strength <= 0.5:
+        return -1.0 + 2.0 * strength * (advised + 1.0)
+    return advised + 2.0 * (strength - 0.5) * (1.0 + 1e-6 - advised)
+
+
+def _survey(
+    query: Query, aabb: NDArray[np.float64], pitch: float, shape: tuple[int, int, int], s: CleanSettings
+) -> _Survey:
+    """Ask the field slab by slab (along x), keeping a float32 and three bits a cell."""
+    opaque_pitch = s.field_pitch or pitch
+    faint_rule = dataclasses.replace(s.rule, threshold=s.rule.threshold * s.faint)
+    origin = lattice_origin(aabb, pitch, shape)
+    xs, ys, zs = (origin[axis] + (np.arange(shape[axis]) + 0.5) * pitch for axis in range(3))
+    signed = np.full(shape, EMPTY, dtype=np.float32)
+    occupied, judged, protected = np.zeros(shape, bool), np.zeros(shape, bool), np.zeros(shape, bool)
+    dropped = 0
+    rows = max(1, s.chunk // (shape[1] * shape[2]))
+    for start in range(0, shape[0], rows):
+        part = slice(start, start + rows)
+        positions = np.stack(np.meshgrid(xs[part], ys, zs, indexing="ij"), axis=-1)
+        inside = ((positions >= aabb[0]) & (positions <= aabb[1])).all(axis=-1)
+        values, places = query(positions[inside]), positions[inside]
+        if s.drop_invalid:
+            invalid = ~(np.isfinite(values) & (values >= 0))
+            dropped += int(invalid.sum())
+            values = np.where(invalid, 0.0, values)
+        else:
+            check_density(values, places, caller="clean")
+        density = np.zeros(inside.shape)
+        density[inside] = values
+        signed[part] = s.rule.encode(density, opaque_pitch, soft=s.soft)
+        occupied[part] = s.rule.occupied(density, opaque_pitch)
+        judged[part] = faint_rule.occupied(density, opaque_pitch)
+        for box in s.keep_boxes:
+            protected[part] |= ((positions >= box[0]) & (positions <= box[1])).all(axis=-1)
+    return _Survey(signed, occupied, judged | occupied, protected, dropped)
+
+
+def _score(
+    survey: _Survey, denoiser: Denoiser, s: CleanSettings, pitch_fraction: float, progress: Progress | None
+) -> tuple[FloatGrid, int]:
+    """Weighted mean of the levels' votes, and the windows it took."""
+    timestep = denoiser.manifest.default_timestep if s.timestep is None else s.timestep
+    total = np.zeros(survey.signed.shape, dtype=np.float32)
+    windows = 0
+    for level, weight in enumerate(s.level_weights):
+        if weight == 0:
+            continue
+        factor = 2**level
+        judged = shrink(survey.judged.astype(np.float32), factor) > 0
+        votes, sent = vote(
+            shrink(survey.signed, factor),
+            judged,
+            denoiser=denoiser,
+            timestep=timestep,
+            edge_fraction=denoiser.manifest.resolution * factor * pitch_fraction,
+            overlap=s.overlap,
+            skip_empty=s.skip_empty,
+            progress=progress,
+        )
+        total += np.float32(weight / sum(s.level_weights)) * grow(votes, factor, total.shape)
+        windows += sent
+    return total, windows

@@ -1,0 +1,175 @@
+"""What ``clean`` decided: a grid of cells to keep, to preview, apply, save and undo. numpy only."""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.aabb import as_aabb
+from ..core.arrays import is_tensor, to_numpy
+from ..core.occupancy import check_density_shape
+
+FORMAT = "unghost-keep-mask"
+FORMAT_VERSION = 1
+
+
+@dataclass(frozen=True)
+class KeepMask:
+    """Cubic cells over a box; the lattice is centred on the box and may stick out by less than a cell.
+
+    Attributes:
+        aabb: ``(2, 3)`` scene units; what lies outside is never changed.
+        pitch: side of a cell, scene units.
+        cells: ``(X, Y, Z)`` bool, True to keep.
+        details: JSON-able: ``occupied``, ``removed``, ``faint_removed`` and ``dropped`` cells, ``windows`` sent,
+            ``regions`` removed (largest first: ``voxels, volume, box, confidence``), ``region_count``, ``settings``.
+    """
+
+    aabb: NDArray[np.float64]
+    pitch: float
+    cells: NDArray[np.bool_]
+    details: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "aabb", as_aabb(self.aabb, caller="KeepMask"))
+        if not (np.isfinite(self.pitch) and self.pitch > 0):
+            raise ValueError(f"KeepMask: pitch must be finite and > 0, got {self.pitch}")
+        sides = self.aabb[1] - self.aabb[0]
+        covered = np.array(self.cells.shape[:3]) * self.pitch
+        if self.cells.ndim != 3 or self.cells.dtype != np.bool_ or (covered < sides * (1 - 1e-5)).any():
+            raise ValueError(
+                f"KeepMask: cells must be bool (X, Y, Z) and cover the box, got {self.cells.dtype} "
+                f"{self.cells.shape} of side {self.pitch} for sides {sides.tolist()}"
+            )
+
+    @property
+    def origin(self) -> NDArray[np.float64]:
+        """``(3,)`` lowest corner of the lattice."""
+        return lattice_origin(self.aabb, self.pitch, self.cells.shape)
+
+    def keep(self, positions: Any) -> Any:
+        """Whether each of ``positions (..., 3)`` is kept: bool ``(...)``, an array or a tensor like the input.
+
+        True outside the box, and for positions that are not finite.
+        """
+        if is_tensor(positions):
+            import torch
+
+            kept = self._keep(to_numpy(positions.detach().float()).astype(np.float64))
+            return torch.as_tensor(kept, device=positions.device)
+        return self._keep(np.asarray(positions, dtype=np.float64))
+
+    def _keep(self, positions: NDArray[np.float64]) -> NDArray[np.bool_]:
+        if positions.shape[-1:] != (3,):
+            raise ValueError(f"KeepMask.keep: positions must have shape (..., 3), got {positions.shape}")
+        inside = ((positions >= self.aabb[0]) & (positions <= self.aabb[1])).all(axis=-1)
+        local = np.where(inside[..., None], positions - self.origin, 0.0)
+        index = np.clip(np.floor(local / self.pitch).astype(np.int64), 0, np.array(self.cells.shape) - 1)
+        kept: NDArray[np.bool_] = self.cells[tuple(np.moveaxis(index, -1, 0))] | ~inside
+        return kept
+
+    def apply(self, density_fn: Callable[[Any], Any]) -> Callable[[Any], Any]:
+        """The cleaned field: ``density_fn`` with its density set to 0 in cells that are not kept.
+
+        It takes and gives what ``density_fn`` does, arrays or tensors; gradients pass where density is kept.
+        """
+
+        def cleaned(positions: Any) -> Any:
+            density = density_fn(positions)
+            flat = check_density_shape(density, positions, caller="KeepMask.apply")
+            kept = self.keep(positions)
+            if density.ndim > flat.ndim:
+                kept = kept[..., None]
+            if is_tensor(density):
+                import torch
+
+                kept = torch.as_tensor(kept, device=density.device)
+                return torch.where(kept, density, torch.zeros_like(density))
+            return np.where(to_numpy(kept), density, np.zeros_like(density))
+
+        return cleaned
+
+    def apply_grid(self, values: NDArray[Any]) -> NDArray[Any]:
+        """A copy of a grid ``(X, Y, Z, ...)`` over the aabb, of any resolution, with 0 in cells not kept.
+
+        Cell-centred; a cell is judged by its centre.
+        """
+        if values.ndim < 3 or 0 in values.shape[:3]:
+            raise ValueError(f"KeepMask.apply_grid: values must have shape (X, Y, Z, ...), got {values.shape}")
+        axes = [
+            low + (np.arange(length) + 0.5) * (high - low) / length
+            for low, high, length in zip(self.aabb[0], self.aabb[1], values.shape)
+        ]
+        kept = np.empty(values.shape[:3], dtype=bool)
+        for row, x in enumerate(axes[0]):  # a slab at a time: positions take 24 bytes a cell
+            kept[row] = self._keep(np.stack(np.meshgrid([x], axes[1], axes[2], indexing="ij"), axis=-1)[0])
+        result: NDArray[Any] = np.where(kept.reshape(kept.shape + (1,) * (values.ndim - 3)), values, 0)
+        return result.astype(values.dtype, copy=False)
+
+    def summary(self) -> dict[str, Any]:
+        """Counts, ``removed_share`` of the occupied cells (0 if there are none), and the removed regions."""
+        occupied, removed = self.details.get("occupied", 0), self.details.get("removed", 0)
+        return {**self.details, "removed_share": removed / occupied if occupied else 0.0}
+
+    def save(self, path: str | Path) -> None:
+        """Write ``.npz`` without pickles: ``manifest`` (JSON) and ``cells`` (bits, C order); whole or not at all."""
+        target = Path(path)
+        manifest = {
+            "format": FORMAT, "format_version": FORMAT_VERSION, "aabb": self.aabb.tolist(), "pitch": self.pitch,
+            "shape": list(self.cells.shape), "details": self.details,
+        }  # fmt: skip
+        partial = target.with_name(target.name + ".partial")
+        try:
+            with partial.open("wb") as stream:
+                text = np.frombuffer(json.dumps(manifest, allow_nan=False).encode(), dtype=np.uint8)
+                np.savez_compressed(stream, manifest=text, cells=np.packbits(self.cells))
+            os.replace(partial, target)
+        finally:
+            partial.unlink(missing_ok=True)
+
+    @classmethod
+    def load(cls, path: str | Path) -> KeepMask:
+        """Read what :meth:`save` wrote.
+
+        Raises:
+            FileNotFoundError: no such file.
+            ValueError: a foreign, truncated or inconsistent file; the message names it.
+        """
+        source = Path(path)
+        try:
+            with source.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
+                manifest, packed = json.loads(archive["manifest"].tobytes().decode()), archive["cells"]
+        except FileNotFoundError:
+            raise
+        except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+            raise ValueError(f"KeepMask.load: {source} is not a keep mask, or is truncated ({error})") from None
+        if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
+            raise ValueError(f"KeepMask.load: {source} is not a keep mask (format must be {FORMAT!r})")
+        if manifest.get("format_version") != FORMAT_VERSION:
+            raise ValueError(
+                f"KeepMask.load: {source} has version {manifest.get('format_version')!r}, "
+                f"this release reads {FORMAT_VERSION}"
+            )
+        try:
+            shape = tuple(int(length) for length in manifest["shape"])
+            count = int(np.prod(shape))
+            if min(shape) < 1 or packed.dtype != np.uint8 or packed.shape != (-(-count // 8),):
+                raise ValueError(f"cells do not fit shape {shape}")
+            cells = np.unpackbits(packed, count=count).reshape(shape).astype(bool)
+            return cls(np.array(manifest["aabb"]), float(manifest["pitch"]), cells, dict(manifest["details"]))
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"KeepMask.load: {source}: {error}") from None
+
+
+def lattice_origin(aabb: NDArray[np.float64], pitch: float, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Lowest corner ``(3,)`` of ``shape`` cells of side ``pitch`` centred on the box."""
+    middle: NDArray[np.float64] = (aabb[0] + aabb[1]) / 2 - np.array(shape) * pitch / 2
+    return middle

@@ -1,0 +1,108 @@
+"""A denoiser's opinion of a whole voxel grid: overlapping windows, averaged. numpy only."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.manifest import Denoiser
+from ..core.occupancy import EMPTY
+from .denoise import BATCH, run_denoiser
+
+FloatGrid = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+Progress = Callable[[int, int], None]
+
+
+def window_weight(resolution: int) -> FloatGrid:
+    """``(R, R, R)`` weight of a window's voxels: a raised cosine, heaviest in the middle, nowhere zero."""
+    axis = np.sin(np.pi * (np.arange(resolution) + 0.5) / resolution) ** 2 + 0.05
+    return (axis[:, None, None] * axis[:, None] * axis).astype(np.float32)
+
+
+def window_starts(length: int, resolution: int, stride: int) -> NDArray[np.int64]:
+    """First indices of windows along an axis of ``length`` cells; they reach out, so that all are covered alike."""
+    last = -(-(length + resolution - 2 * stride) // stride)
+    return np.arange(max(last, 0) + 1) * stride - (resolution - stride)
+
+
+def shrink(signed: FloatGrid, factor: int) -> FloatGrid:
+    """Largest value of each block of ``factor^3`` cells; what sticks out is padded with empty."""
+    if factor == 1:
+        return signed
+    pad = [(0, -length % factor) for length in signed.shape]
+    padded = np.pad(signed, pad, constant_values=EMPTY)
+    x, y, z = (length // factor for length in padded.shape)
+    result: FloatGrid = padded.reshape(x, factor, y, factor, z, factor).max(axis=(1, 3, 5))
+    return result
+
+
+def grow(values: FloatGrid, factor: int, shape: tuple[int, ...]) -> FloatGrid:
+    """Repeat each cell ``factor`` times along each axis and cut to ``shape``."""
+    for axis in range(3):
+        values = np.repeat(values, factor, axis=axis)
+    return values[: shape[0], : shape[1], : shape[2]]
+
+
+def vote(
+    signed: FloatGrid,
+    wanted: Mask,
+    *,
+    denoiser: Denoiser,
+    timestep: int,
+    edge_fraction: float,
+    overlap: float = 0.5,
+    skip_empty: bool = True,
+    progress: Progress | None = None,
+) -> tuple[FloatGrid, int]:
+    """Weighted mean of ``x0_pred`` over all windows that hold a cell.
+
+    Args:
+        signed: ``(X, Y, Z)`` signed opacity; what lies beyond counts as empty.
+        wanted: ``(X, Y, Z)`` where an answer is needed; windows without such a cell are not sent (their
+            answer could not matter), unless ``skip_empty`` is False.
+        denoiser: of one channel.
+        timestep: in [0, 1000).
+        edge_fraction: of a window.
+        overlap: of neighbouring windows along an axis, in [0, 1).
+        skip_empty: see ``wanted``.
+        progress: called with (windows done, windows in all).
+
+    Returns:
+        ``(X, Y, Z)`` float32 in [-1, 1], ``EMPTY`` where no window was sent; and how many were sent.
+    """
+    resolution = denoiser.manifest.resolution
+    stride = max(1, round(resolution * (1.0 - overlap)))
+    starts = [window_starts(length, resolution, stride) for length in signed.shape]
+    pad = [(-int(s[0]), int(s[-1]) + resolution - length) for s, length in zip(starts, signed.shape)]
+    padded = np.pad(signed, pad, constant_values=EMPTY)
+    needed = np.pad(wanted, pad)
+    corners = [
+        corner
+        for corner in itertools.product(*[(s - s[0]).tolist() for s in starts])
+        if not skip_empty or needed[_box(corner, resolution)].any()
+    ]
+    total = np.zeros(padded.shape, dtype=np.float32)
+    weights = np.zeros(padded.shape, dtype=np.float32)
+    weight = window_weight(resolution)
+    for start in range(0, len(corners), BATCH):
+        batch = corners[start : start + BATCH]
+        channels = np.stack([padded[_box(corner, resolution)] for corner in batch])[:, None]
+        fractions = np.full(len(batch), edge_fraction)
+        predictions = run_denoiser(denoiser, channels, timestep, fractions, caller="clean")
+        for corner, prediction in zip(batch, predictions):
+            total[_box(corner, resolution)] += weight * prediction[0]
+            weights[_box(corner, resolution)] += weight
+        if progress is not None:
+            progress(start + len(batch), len(corners))
+    mean = np.full(padded.shape, EMPTY, dtype=np.float32)
+    np.divide(total, weights, out=mean, where=weights > 0)
+    inner = tuple(slice(before, before + length) for (before, _), length in zip(pad, signed.shape))
+    return mean[inner], len(corners)
+
+
+def _box(corner: tuple[int, ...], resolution: int) -> tuple[slice, ...]:
+    return tuple(slice(start, start + resolution) for start in corner)
