@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from ..core.manifest import METADATA_KEY, Manifest
+from ..core.schedule import TIMESTEPS
 from .network import NetworkConfig, RestorationNet
 
 CONFIG_KEY = "unghost_network"
@@ -83,17 +84,25 @@ class TorchDenoiser:
 
         Returns:
             ``x0_pred (N, 1, 32, 32, 32)`` float32 in [-1, 1], on the device of ``channels``.
+
+        Raises:
+            TypeError: timesteps that are not integers.
+            ValueError: shapes, or values out of range.
         """
         device = self.network.gain.device
         count = (len(channels),)
         times = torch.as_tensor(timestep, device=device)
         if times.is_floating_point() or times.dtype == torch.bool:
             raise TypeError(f"TorchDenoiser: timestep must be an integer, got dtype {times.dtype}")
-        if bool(((times < 0) | (times >= 1000)).any()):
-            raise ValueError(f"TorchDenoiser: timestep must lie in [0, 1000), got {times.min()} .. {times.max()}")
+        if bool(((times < 0) | (times >= TIMESTEPS)).any()):
+            raise ValueError(
+                f"TorchDenoiser: timestep must lie in [0, {TIMESTEPS}), got {times.min()} .. {times.max()}"
+            )
         edges = torch.as_tensor(edge_fraction, device=device, dtype=torch.float32)
         if not bool((torch.isfinite(edges) & (edges > 0)).all()):
             raise ValueError("TorchDenoiser: edge_fraction must be finite and > 0")
+        if not bool(torch.isfinite(channels).all()):
+            raise ValueError("TorchDenoiser: channels must be finite")
         times = times.expand(count) if times.ndim == 0 else times
         edges = edges.expand(count) if edges.ndim == 0 else edges
         x0_pred: Tensor = self.network(channels.to(device, torch.float32), times, edges).to(channels.device)

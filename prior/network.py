@@ -110,7 +110,7 @@ def condition_features(timestep: Tensor, edge_fraction: Tensor) -> Tensor:
     edge = torch.tanh(torch.log(edge_fraction.float() / EDGE_FRACTION_CENTER) / EDGE_FRACTION_SPREAD)
     base = torch.stack([time, edge], dim=1)
     waves = math.pi * 2.0 ** torch.arange(-1, FREQUENCIES - 1, device=base.device, dtype=base.dtype)
-    angles = (base[:, :, None] * waves).reshape(len(base), -1)
+    angles = (base[:, :, None] * waves).flatten(1)
     return torch.cat([base, torch.sin(angles), torch.cos(angles)], dim=1)
 
 

@@ -25,9 +25,10 @@ def interesting_voxels(signed_opacity: Tensor, labels: Tensor) -> Tensor:
         ``(N, 1, R, R, R)`` bool.
     """
     opaque = opacity_from_signed(signed_opacity) > DEFAULT_OPACITY_THRESHOLD
-    seeds = opaque | (labels == SURFACE_LABEL)[:, None]
+    seeds: Tensor = opaque | (labels == SURFACE_LABEL)[:, None]
     for axis in (2, 3, 4):  # a box is separable; torch's max_pool3d takes ten times as long on a CPU
-        grown, last = seeds.clone(), seeds.shape[axis] - 1
+        grown = seeds.clone()
+        last = seeds.shape[axis] - 1
         grown.narrow(axis, 1, last).logical_or_(seeds.narrow(axis, 0, last))
         grown.narrow(axis, 0, last).logical_or_(seeds.narrow(axis, 1, last))
         seeds = grown

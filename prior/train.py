@@ -24,6 +24,8 @@ from .trainer import Trainer
 
 MODEL_FILE, STATE_FILE, CONFIG_FILE, LOG_FILE = "model.safetensors", "state.safetensors", "config.json", "log.jsonl"
 
+BAR_FORMAT = "{percentage:5.1f}% |{bar}| {elapsed} < {remaining}, {postfix}"
+
 
 @dataclass(frozen=True)
 class TrainResult:
@@ -140,7 +142,7 @@ def _run(
     from tqdm import tqdm
 
     config = trainer.config
-    bar = tqdm(total=config.steps, initial=trainer.step, disable=not progress, unit="step", dynamic_ncols=True)
+    bar = tqdm(total=1.0, initial=trainer.progress, disable=not progress, dynamic_ncols=True, bar_format=BAR_FORMAT)
     begun, carried = time.monotonic(), trainer.elapsed
     first, saved, validated, shown = trainer.step, begun, begun, 0.0
     batches = mixture.stream(trainer.step, config.batch_size)
@@ -151,8 +153,8 @@ def _run(
             trainer.elapsed = carried + now - begun
             shown = values["loss"] if not shown else 0.98 * shown + 0.02 * values["loss"]
             rate = (trainer.step - first) * config.batch_size / max(now - begun, 1e-9)
-            bar.update()
-            bar.set_postfix(loss=f"{shown:.4f}", cubes_per_second=f"{rate:.0f}", budget=f"{trainer.progress:.1%}")
+            bar.set_postfix_str(f"step {trainer.step}, loss {shown:.4f}, {rate:.0f} cubes/s", refresh=False)
+            bar.update(trainer.progress - bar.n)
             if trainer.step % 20 == 0 or trainer.step == 1:
                 log.scalars(trainer.step, {f"train/{key}": value for key, value in values.items()})
                 log.line(trainer.step, "train", {**values, "seconds": round(trainer.elapsed, 1)})

@@ -1,0 +1,98 @@
+"""Our ONNX files: a model body, then its manifest as the file's last field.
+
+Protobuf messages concatenate: an ONNX model followed by one ``metadata_props`` entry is the same model with
+that entry. So the body is hashed as bytes, the manifest that holds the hash follows it, and a reader
+needs no ONNX parser to tell a whole file from a truncated or altered one. The entry ends the file:
+
+    body | 0x72 | varint(length) | 0x0A varint(len key) key | 0x12 varint(len value) value
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import os
+from pathlib import Path
+
+from ..core.manifest import METADATA_KEY, Manifest
+
+METADATA_TAG, KEY_TAG, VALUE_TAG = b"\x72", b"\x0a", b"\x12"  # fields 14, 1 and 2, length-delimited
+
+
+def _varint(value: int) -> bytes:
+    out = bytearray()
+    while value > 0x7F:
+        out.append(value & 0x7F | 0x80)
+        value >>= 7
+    return bytes(out) + bytes([value])
+
+
+def _read_varint(data: bytes, at: int) -> tuple[int, int]:
+    """Value and the position after it; IndexError past the end."""
+    value = shift = 0
+    while True:
+        byte = data[at]
+        value |= (byte & 0x7F) << shift
+        at, shift = at + 1, shift + 7
+        if byte < 0x80:
+            return value, at
+
+
+def _entry_head(value_bytes: int) -> bytes:
+    """Everything of the entry that stands before the value."""
+    key = METADATA_KEY.encode()
+    inner = KEY_TAG + _varint(len(key)) + key + VALUE_TAG + _varint(value_bytes)
+    return METADATA_TAG + _varint(len(inner) + value_bytes) + inner
+
+
+def seal(body: bytes, manifest: Manifest) -> bytes:
+    """The whole file: ``body``, then ``manifest`` with the body's length and SHA-256 filled in."""
+    digest = hashlib.sha256(body).hexdigest()
+    value = dataclasses.replace(manifest, body_bytes=len(body), body_sha256=digest).to_json().encode()
+    return body + _entry_head(len(value)) + value
+
+
+def write_sealed(path: str | Path, body: bytes, manifest: Manifest) -> None:
+    """Write :func:`seal` to a file, whole or not at all."""
+    target = Path(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    partial = target.with_name(target.name + ".partial")
+    with partial.open("wb") as stream:
+        stream.write(seal(body, manifest))
+        stream.flush()
+        os.fsync(stream.fileno())
+    os.replace(partial, target)
+
+
+def unseal(data: bytes, *, origin: str) -> Manifest:
+    """Check a whole file and return its manifest; ``origin`` names it in errors.
+
+    Raises:
+        ValueError: no manifest at the end (foreign or truncated), or a body that its hash does not match.
+    """
+    marker = KEY_TAG + _varint(len(METADATA_KEY)) + METADATA_KEY.encode() + VALUE_TAG
+    at = data.rfind(marker)
+    if at < 0:
+        raise ValueError(
+            f"{origin}: no {METADATA_KEY!r} entry: not an unghost ONNX model, or truncated ({len(data)} bytes)"
+        )
+    try:
+        length, start = _read_varint(data, at + len(marker))
+    except IndexError:
+        raise ValueError(f"{origin}: truncated inside its manifest ({len(data)} bytes)") from None
+    if start + length != len(data):
+        what = "truncated inside its manifest" if start + length > len(data) else "bytes follow its manifest"
+        raise ValueError(f"{origin}: {what} ({len(data)} bytes, {start + length} expected)")
+    try:
+        text = data[start:].decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{origin}: its manifest is not UTF-8 ({error})") from None
+    manifest = Manifest.from_json(text, origin=origin)
+    body = data[: manifest.body_bytes]
+    if data[len(body) : start] != _entry_head(length):
+        raise ValueError(
+            f"{origin}: its body has {start - len(_entry_head(length))} bytes, its manifest says {manifest.body_bytes}"
+        )
+    if hashlib.sha256(body).hexdigest() != manifest.body_sha256:
+        raise ValueError(f"{origin}: the body does not match the SHA-256 in its manifest: altered or damaged")
+    return manifest

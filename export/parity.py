@@ -1,0 +1,136 @@
+"""How far an ONNX denoiser is from the checkpoint it was made from."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.frames import RESOLUTION, unit_lattice
+from ..core.manifest import Denoiser, Manifest
+from ..core.occupancy import EMPTY, OCCUPIED, occupancy_from_signed, signed_from_opacity
+from ..core.schedule import TIMESTEPS
+
+if TYPE_CHECKING:
+    from ..prior.checkpoint import TorchDenoiser
+
+ERROR_TOLERANCE, FLIP_TOLERANCE = 1e-4, 1e-5
+
+
+@dataclass(frozen=True)
+class ParityInputs:
+    """``channels (N, C, R, R, R)``, ``timestep (N,)``, ``edge_fraction (N,)``: what both sides are asked."""
+
+    channels: NDArray[np.float32]
+    timestep: NDArray[np.int64]
+    edge_fraction: NDArray[np.float32]
+
+
+def _opacity(rng: np.random.Generator, kind: int) -> NDArray[Any]:
+    """One cube of opacity: empty, full, noise, bits, a soft ball, a ramp, a wall with fog, sparse salt."""
+    shape = (RESOLUTION,) * 3
+    lattice = unit_lattice()
+    distance = np.linalg.norm(lattice - rng.uniform(-0.4, 0.4, 3), axis=-1)
+    if kind == 0:
+        return np.zeros(shape)
+    if kind == 1:
+        return np.ones(shape)
+    if kind == 2:
+        return rng.random(shape)
+    if kind == 3:
+        return (rng.random(shape) < rng.random()).astype(np.float64)
+    if kind == 4:
+        return 1.0 / (1.0 + np.exp(np.clip((distance - 0.3) * 60.0, -50, 50)))
+    if kind == 5:
+        return np.clip(lattice @ rng.normal(size=3) + 0.5, 0.0, 1.0)
+    if kind == 6:
+        return np.maximum(np.abs(lattice[..., 0] - rng.uniform(-0.4, 0.4)) < 0.06, 0.3 * np.exp(-8.0 * distance))
+    return np.where(rng.random(shape) < 0.01, 1.0, 1e-6)
+
+
+def parity_inputs(cubes: int, seed: int, *, channels: int = 1) -> ParityInputs:
+    """Empty, full, random and structured cubes in turn, with timesteps 0 and 999 and edges 1e-6 to 10 among them."""
+    if cubes < 1:
+        raise ValueError(f"parity_inputs: cubes must be >= 1, got {cubes}")
+    values = np.empty((cubes, channels, *(RESOLUTION,) * 3), np.float32)
+    times, edges = np.empty(cubes, np.int64), np.empty(cubes, np.float32)
+    for index in range(cubes):
+        rng = np.random.default_rng([seed, index])
+        for channel in range(channels):
+            values[index, channel] = signed_from_opacity(_opacity(rng, (index + channel) % 8))
+        times[index] = (0, TIMESTEPS - 1, int(rng.integers(TIMESTEPS)))[index // 8 % 3]
+        edges[index] = (0.05, 1e-6, 10.0, math.exp(rng.uniform(math.log(0.01), 0.0)))[index // 24 % 4]
+    return ParityInputs(np.clip(values, EMPTY, OCCUPIED), times, edges)
+
+
+def session_denoiser(body: bytes, manifest: Manifest) -> Denoiser:
+    """A denoiser from a model that is not on disk yet."""
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(body, providers=["CPUExecutionProvider"])
+
+    class _Session:
+        kind = "numpy"
+
+        def __init__(self) -> None:
+            self.manifest = manifest
+
+        def __call__(self, channels: Any, timestep: Any, edge_fraction: Any) -> Any:
+            feed = {"channels": channels, "timestep": timestep, "edge_fraction": edge_fraction}
+            return session.run(["x0_pred"], feed)[0]
+
+    return _Session()
+
+
+def compare(exported: Denoiser, reference: TorchDenoiser, inputs: ParityInputs) -> dict[str, Any]:
+    """Run both and count.
+
+    Returns:
+        ``cubes``, ``max_error``, ``mean_error`` (of ``x0_pred``), ``flips`` and ``flip_rate`` (voxels on
+        different sides of the decision), ``passed`` (within 1e-4 and 1e-5).
+    """
+    import torch
+
+    worst, total, flips, voxels = 0.0, 0.0, 0, 0
+    for start in range(0, len(inputs.channels), 32):
+        part = slice(start, start + 32)
+        asked = (inputs.channels[part], inputs.timestep[part], inputs.edge_fraction[part])
+        expected = reference(*(torch.from_numpy(value) for value in asked)).numpy()
+        found = np.asarray(exported(*asked))
+        error = np.abs(found.astype(np.float64) - expected)
+        worst = max(worst, float(error.max()) if np.isfinite(error).all() else math.inf)
+        total, voxels = total + float(error.sum()), voxels + error.size
+        flips += int((occupancy_from_signed(found) != occupancy_from_signed(expected)).sum())
+    return {
+        "cubes": len(inputs.channels), "max_error": worst, "mean_error": total / voxels, "flips": flips,
+        "flip_rate": flips / voxels, "passed": worst < ERROR_TOLERANCE and flips / voxels <= FLIP_TOLERANCE,
+    }  # fmt: skip
+
+
+def verify(
+    onnx_path: str | Path, checkpoint_path: str | Path, *, cubes: int = 256, seed: int = 0, threads: int | None = None
+) -> dict[str, Any]:
+    """Compare an ONNX file with its checkpoint in torch fp32 on the CPU; see :func:`compare` for the result.
+
+    Raises:
+        ImportError: torch or safetensors is missing.
+        ValueError: either file is unreadable, or they take different channels.
+    """
+    try:
+        from ..prior.checkpoint import load_model
+    except ImportError as error:
+        raise ImportError(f"verify: needs {error.name}: pip install unghost[export]") from None
+    from .runtime import OnnxDenoiser
+
+    exported = OnnxDenoiser(onnx_path, threads=threads, providers=["CPUExecutionProvider"])
+    reference = load_model(checkpoint_path)
+    if exported.manifest.channels != reference.manifest.channels:
+        raise ValueError(
+            f"verify: {onnx_path} takes {exported.manifest.channels}, {checkpoint_path} {reference.manifest.channels}"
+        )
+    inputs = parity_inputs(cubes, seed, channels=len(reference.manifest.channels))
+    return compare(exported, reference, inputs)

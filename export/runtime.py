@@ -1,0 +1,134 @@
+"""A denoiser from an ONNX file: numpy and onnxruntime, nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.frames import RESOLUTION
+from ..core.manifest import Manifest
+from ..core.schedule import check_timestep
+from .container import unseal
+
+CHUNK = 64  # cubes in one call of onnxruntime; bounds the memory of large batches
+
+
+def read_manifest(path: str | Path) -> Manifest:
+    """The manifest of an ONNX file, after checking the whole file against it."""
+    return unseal(_read(path), origin=str(path))
+
+
+def _read(path: str | Path) -> bytes:
+    source = Path(path)
+    if not source.is_file():
+        raise ValueError(f"{source}: no such file")
+    return source.read_bytes()
+
+
+def _open(data: bytes, threads: int | None, providers: Sequence[str] | None, origin: str) -> Any:
+    import onnxruntime
+
+    available = onnxruntime.get_available_providers()
+    if providers is None:
+        providers = [name for name in ("CUDAExecutionProvider", "CPUExecutionProvider") if name in available]
+    missing = [name for name in providers if name not in available]
+    if missing:
+        raise ValueError(f"OnnxDenoiser: providers {missing} are not available, onnxruntime has {available}")
+    options = onnxruntime.SessionOptions()
+    if threads is not None:
+        if threads < 1:
+            raise ValueError(f"OnnxDenoiser: threads must be >= 1 or None, got {threads}")
+        options.intra_op_num_threads = threads
+    try:
+        return onnxruntime.InferenceSession(data, options, providers=list(providers))
+    except Exception as error:  # onnxruntime's errors share no public base class
+        raise ValueError(f"{origin}: onnxruntime cannot load it ({error})") from None
+
+
+def _edge_fractions(edge_fraction: Any, count: int) -> NDArray[np.float32]:
+    value = np.asarray(edge_fraction)
+    if value.dtype.kind not in "fiu":
+        raise TypeError(f"OnnxDenoiser: edge_fraction must be real, got dtype {value.dtype}")
+    if value.shape not in ((), (count,)):
+        raise ValueError(f"OnnxDenoiser: edge_fraction must have shape () or ({count},), got {value.shape}")
+    edges = np.broadcast_to(value, (count,)).astype(np.float32)
+    if not (np.isfinite(edges) & (edges > 0)).all():
+        worst = edges[~(np.isfinite(edges) & (edges > 0))][0]
+        raise ValueError(f"OnnxDenoiser: edge_fraction must be finite and > 0 in float32, got {worst}")
+    return edges
+
+
+class OnnxDenoiser:
+    """``(channels, timestep, edge_fraction) -> x0_pred`` on numpy arrays.
+
+    Example:
+        >>> denoiser = OnnxDenoiser("prior.onnx", threads=2)          # doctest: +SKIP
+        >>> x0_pred = denoiser(channels, denoiser.manifest.default_timestep, 0.05)      # doctest: +SKIP
+    """
+
+    kind = "numpy"
+
+    def __init__(self, path: str | Path, *, threads: int | None = None, providers: Sequence[str] | None = None) -> None:
+        """Open and check a file.
+
+        Args:
+            path: of ``unghost.export.to_onnx.export_onnx``.
+            threads: of onnxruntime, inside operators; None leaves it the choice.
+            providers: execution providers in order; None for CUDA where there is one, then the CPU.
+
+        Raises:
+            ValueError: missing, truncated, foreign or altered file; unknown provider.
+        """
+        data = _read(path)
+        self.manifest = unseal(data, origin=str(path))
+        self._session = _open(data, threads, providers, str(path))
+
+    @property
+    def providers(self) -> list[str]:
+        """Execution providers in use, the first preferred."""
+        names: list[str] = self._session.get_providers()
+        return names
+
+    def __call__(self, channels: Any, timestep: Any, edge_fraction: Any) -> NDArray[np.float32]:
+        """Denoise.
+
+        Args:
+            channels: ``(N, C, 32, 32, 32)`` float32 in [-1, 1]; N may be 0.
+            timestep: ``(N,)`` integers in [0, 1000), or one for all.
+            edge_fraction: ``(N,)`` finite and > 0, or one for all: edge length over the scene's extent.
+
+        Returns:
+            ``x0_pred (N, 1, 32, 32, 32)`` float32 in [-1, 1].
+
+        Raises:
+            TypeError: channels not float32, timesteps not integers.
+            ValueError: shapes, or values out of range.
+        """
+        if not isinstance(channels, np.ndarray) or channels.dtype != np.float32:
+            found = getattr(channels, "dtype", type(channels).__name__)
+            raise TypeError(f"OnnxDenoiser: channels must be a float32 numpy array, got {found}")
+        cube = (len(self.manifest.channels), RESOLUTION, RESOLUTION, RESOLUTION)
+        if channels.shape[1:] != cube or channels.ndim != 5:
+            raise ValueError(f"OnnxDenoiser: channels must have shape (N, {str(cube)[1:]}, got {channels.shape}")
+        if not np.isfinite(channels).all():
+            raise ValueError(f"OnnxDenoiser: channels must be finite, got {int((~np.isfinite(channels)).sum())} others")
+        count = len(channels)
+        times = check_timestep(timestep, caller="OnnxDenoiser")
+        if times.shape not in ((), (count,)):
+            raise ValueError(f"OnnxDenoiser: timestep must have shape () or ({count},), got {times.shape}")
+        times = np.broadcast_to(times, (count,))
+        edges = _edge_fractions(edge_fraction, count)
+        x0_pred = np.empty((count, 1, *cube[1:]), np.float32)
+        for start in range(0, count, CHUNK):
+            part = slice(start, start + CHUNK)
+            feed = {
+                "channels": np.ascontiguousarray(channels[part]),
+                "timestep": np.ascontiguousarray(times[part]),
+                "edge_fraction": edges[part],
+            }
+            x0_pred[part] = self._session.run(["x0_pred"], feed)[0]
+        return x0_pred
