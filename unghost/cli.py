@@ -1,4 +1,4 @@
-"""The command ``unghost``: one verb each, arguments from the functions in :mod:`unghost.commands`."""
+"""The command ``unghost``: one verb each, arguments from the functions of the same names."""
 
 from __future__ import annotations
 
@@ -21,13 +21,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     import tyro
 
-    from .commands import VERBS
+    from . import commands, commands_prior
 
+    verbs = {
+        "demo": commands.demo,
+        "clean": commands.clean,
+        "bench": commands.bench,
+        "curate": commands_prior.curate,
+        "harvest": commands_prior.harvest,
+        "train": commands_prior.train,
+        "export": commands_prior.export,
+        "verify": commands_prior.verify,
+    }
     words = list(sys.argv[1:] if argv is None else argv)
-    verb = next((word for word in words if word in VERBS), "")
+    verb = next((word for word in words if word in verbs), "")
     try:
         status = tyro.extras.subcommand_cli_from_dict(
-            VERBS, prog="unghost", args=words, description="Take ghosts out of radiance fields."
+            verbs, prog="unghost", args=words, description="Take ghosts out of radiance fields."
         )
     except USER_ERRORS as error:
         if isinstance(error, ImportError) and (error.name or "").startswith(__package__):

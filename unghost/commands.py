@@ -1,10 +1,13 @@
-"""What each verb of ``unghost`` does. Signatures are the command line; heavy imports wait for the verb."""
+"""The verbs that use a prior. Signatures are the command line; heavy imports wait for the verb."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+Threads = Annotated[int, arg(help="of onnxruntime; 0 leaves the choice to it.")]
 
 
 def demo(out: Path = Path("out/demo"), seed: int = 0) -> None:
@@ -21,4 +24,63 @@ def demo(out: Path = Path("out/demo"), seed: int = 0) -> None:
     print(f"look at {out / 'index.html'}")
 
 
-VERBS: dict[str, Callable[..., Any]] = {"demo": demo}
+def clean(
+    grid: Positional[Path],
+    out: Path | None = None,
+    keep: Path | None = None,
+    denoiser: str = "default",
+    strength: float = 0.5,
+    threads: Threads = 0,
+) -> None:
+    """Clean a density grid: an .npz with density (X, Y, Z) per scene unit and aabb (2, 3), cubic cells.
+
+    Args:
+        grid: the file to clean; it is not changed.
+        out: the cleaned grid; GRID-clean.npz beside it if not given.
+        keep: the mask of what was kept, which undoes or repeats the cleaning; GRID-keep.npz if not given.
+        denoiser: a shipped name or an .onnx file.
+        strength: 0 removes nothing, 0.5 what the denoiser advises, 1 everything.
+        threads: of onnxruntime; 0 leaves the choice to it.
+    """
+    from .cleaning import clean as clean_field
+    from .denoisers import load_denoiser
+    from .grids import cell_pitch, grid_density_fn, load_grid, save_grid
+
+    density, aabb = load_grid(grid)
+    mask = clean_field(
+        grid_density_fn(density, aabb), aabb, denoiser=load_denoiser(denoiser, backend="onnx", threads=threads or None),
+        field_pitch=cell_pitch(aabb, density.shape, caller="clean"), strength=strength,
+    )  # fmt: skip
+    out = out or grid.with_name(f"{grid.stem}-clean.npz")
+    keep = keep or grid.with_name(f"{grid.stem}-keep.npz")
+    save_grid(out, mask.apply_grid(density), aabb)
+    keep.parent.mkdir(parents=True, exist_ok=True)
+    mask.save(keep)
+    summary = mask.summary()
+    print(f"removed {summary['removed']} of {summary['occupied']} occupied cells ({summary['removed_share']:.1%})")
+    print(f"cleaned grid: {out}\nkeep mask: {keep}")
+
+
+def bench(
+    denoiser: str = "default", batch: int = 40, threads: Threads = 0, seconds: float = 5.0, out: Path | None = None
+) -> None:
+    """Measure how many 32^3 cubes a second a denoiser restores through onnxruntime.
+
+    Args:
+        denoiser: a shipped name or an .onnx file.
+        batch: cubes a call.
+        threads: of onnxruntime; 0 leaves the choice to it.
+        seconds: how long to measure, after three calls to warm up.
+        out: also write the result as JSON here.
+    """
+    from .bench import measure_speed
+    from .core.results import build_results, write_results
+    from .denoisers import load_denoiser
+
+    model = load_denoiser(denoiser, backend="onnx", threads=threads or None)
+    row = measure_speed(model, batch=batch, seconds=seconds)
+    print(f"{row['cubes_per_second']:.0f} cubes/s (batch {batch}, median of {row['calls']} calls, "
+          f"{row['milliseconds']:.1f} ms each)")  # fmt: skip
+    if out is not None:
+        rows = [{"method": model.manifest.name, **row, "threads": threads}]
+        write_results(out, build_results(rows, seeds=[0], weights=model.manifest.body_sha256))

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import zipfile
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -72,3 +75,45 @@ def grid_density_fn(density: NDArray[Any], aabb: ArrayLike) -> DensityFn:
         return np.where(inside, total, np.float32(0.0))[..., None]
 
     return density_fn
+
+
+def load_grid(path: str | Path) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """Read ``density (X, Y, Z)`` and ``aabb (2, 3)`` from an ``.npz`` file.
+
+    Returns:
+        density ``(X, Y, Z)`` float32, and the box.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: not an ``.npz`` file, an array missing or of the wrong shape, an impossible box.
+    """
+    source = Path(path)
+    try:
+        with np.load(source, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in ("density", "aabb") if name in archive}
+    except FileNotFoundError:
+        raise FileNotFoundError(f"load_grid: no file {source}") from None
+    except (OSError, ValueError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+        raise ValueError(f"load_grid: {source} is not an .npz file, or is truncated ({error})") from None
+    missing = sorted({"density", "aabb"} - set(arrays))
+    if missing:
+        raise ValueError(f"load_grid: {source} must hold the arrays density and aabb, lacks {', '.join(missing)}")
+    density = arrays["density"]
+    if density.ndim == 4 and density.shape[-1] == 1:
+        density = density[..., 0]
+    if density.ndim != 3 or 0 in density.shape:
+        raise ValueError(f"load_grid: density in {source} must have shape (X, Y, Z), got {density.shape}")
+    return density.astype(np.float32), as_aabb(arrays["aabb"], caller=f"load_grid: {source}")
+
+
+def save_grid(path: str | Path, density: NDArray[Any], aabb: ArrayLike) -> None:
+    """Write what :func:`load_grid` reads; whole or not at all."""
+    target = Path(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    partial = target.with_name(target.name + ".partial")
+    try:
+        with partial.open("wb") as stream:
+            np.savez_compressed(stream, density=density, aabb=as_aabb(aabb, caller="save_grid"))
+        os.replace(partial, target)
+    finally:
+        partial.unlink(missing_ok=True)

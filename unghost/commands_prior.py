@@ -1,0 +1,183 @@
+"""The verbs that make a prior: data, training, export. Heavy imports wait for the verb."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+from tyro.conf import Positional, UseAppendAction
+
+
+def curate(
+    recipe: Positional[str], out: Path, count: int = 20_000, seed: int = 0, workers: int = 1,
+    mesh_root: Path | None = None,
+) -> None:  # fmt: skip
+    """Make training pairs from a recipe: procedural cubes or meshes, and their corruptions.
+
+    Args:
+        recipe: a built-in name (procedural, meshes) or a .toml file.
+        out: folder for the shards; a killed run continues there.
+        count: pairs.
+        seed: pair i depends on (seed, i) alone.
+        workers: processes; the bytes do not depend on it.
+        mesh_root: folder with the meshes and their manifest.csv, for recipes that read meshes.
+    """
+    from .data_recipes.curate import curate as make
+    from .data_recipes.recipe import load_recipe
+
+    shards = make(load_recipe(recipe), out, count=count, seed=seed, workers=workers, mesh_root=mesh_root, progress=True)
+    print(f"{count} pairs in {len(shards)} shard{'s' if len(shards) > 1 else ''} under {out}")
+
+
+def harvest(out: Path, scenes: int = 16, seed: int = 0, first: int = 0, workers: int = 1) -> None:
+    """Fit radiance fields to few photos of synthetic scenes; cut out cubes beside the truth.
+
+    Args:
+        out: folder for the shards, one a scene; a killed run continues there.
+        scenes: how many.
+        seed: scene i depends on (seed, i) alone.
+        first: number of the first scene.
+        workers: processes.
+    """
+    from .data_recipes.harvest import harvest as make
+
+    pairs = make(out, scenes=scenes, seed=seed, first=first, workers=workers, progress=True, log=print)
+    print(f"{pairs} pairs under {out}")
+
+
+def expand_shards(spec: str) -> list[tuple[Path, float]]:
+    """``FOLDER`` or ``FOLDER=WEIGHT`` to shards and their weights.
+
+    A folder that is no shard itself stands for the shards in it, which share its weight by their length.
+
+    Raises:
+        ValueError: the weight is no positive number, or there is no shard.
+    """
+    from .core.shards import read_shard
+
+    name, separator, number = spec.rpartition("=")
+    folder = Path(name if separator else spec)
+    try:
+        weight = float(number) if separator else 1.0
+    except ValueError:
+        raise ValueError(f"expand_shards: {spec!r} must be FOLDER or FOLDER=WEIGHT, the weight a number") from None
+    if not 0 < weight < float("inf"):
+        raise ValueError(f"expand_shards: the weight in {spec!r} must be finite and > 0")
+    if (folder / "manifest.json").is_file():
+        return [(folder, weight)]
+    found = sorted(path.parent for path in folder.glob("*/manifest.json") if path.parent.suffix != ".partial")
+    if not found:
+        raise ValueError(f"expand_shards: {folder} is not a shard and holds none")
+    lengths = [len(read_shard(path)) for path in found]
+    return [(path, weight * length / sum(lengths)) for path, length in zip(found, lengths)]
+
+
+def _named_shards(specs: list[str]) -> dict[str, Path]:
+    """``NAME=FOLDER`` to a table of validation shards."""
+    table: dict[str, Path] = {}
+    for spec in specs:
+        name, separator, folder = spec.partition("=")
+        if not (name and separator and folder):
+            raise ValueError(f"train: --validation must be NAME=FOLDER, got {spec!r}")
+        found = expand_shards(folder)
+        for path, _ in found:
+            table[name if len(found) == 1 else f"{name}/{path.name}"] = path
+    return table
+
+
+def train(
+    shards: Positional[list[str]],
+    out: Path,
+    validation: UseAppendAction[list[str]] = [],  # noqa: B006 (tyro reads the default, nobody changes it)
+    config: Path | None = None,
+    name: str | None = None,
+    steps: int | None = None,
+    max_seconds: float | None = None,
+    batch_size: int | None = None,
+    learning_rate: float | None = None,
+    seed: int | None = None,
+    precision: str | None = None,
+    device: str | None = None,
+    threads: int | None = None,
+    threshold_from: str | None = None,
+    init_from: str | None = None,
+    resume: bool = False,
+) -> None:
+    """Train a restoration prior from shards; writes model.safetensors, logs and checkpoints.
+
+    Args:
+        shards: FOLDER or FOLDER=WEIGHT, a shard or a folder of shards.
+        out: folder of the run.
+        validation: NAME=FOLDER, held out; may be given several times.
+        config: JSON of a TrainConfig (each run writes its own); the options below override it.
+        name: of the model.
+        steps: optimiser steps.
+        max_seconds: time budget.
+        batch_size: cubes a step.
+        learning_rate: peak.
+        seed: of the weights and of the stream of samples.
+        precision: auto, bf16 or fp32.
+        device: as torch names it.
+        threads: of torch; 0 leaves it alone.
+        threshold_from: the validation name that sets the model's removal threshold.
+        init_from: a model.safetensors to start from.
+        resume: go on where a killed run stopped.
+    """
+    from .prior.config import TrainConfig
+    from .prior.train import train as run
+
+    given: dict[str, Any] = {
+        "name": name, "steps": steps, "max_seconds": max_seconds, "batch_size": batch_size, "seed": seed,
+        "learning_rate": learning_rate, "precision": precision, "device": device, "threads": threads,
+        "threshold_from": threshold_from, "init_from": init_from,
+    }  # fmt: skip
+    base = TrainConfig() if config is None else TrainConfig.from_dict(json.loads(config.read_text(encoding="utf-8")))
+    chosen = dataclasses.replace(base, **{key: value for key, value in given.items() if value is not None})
+    result = run(
+        chosen, train_shards=[pair for spec in shards for pair in expand_shards(spec)],
+        validation_shards=_named_shards(validation), out=out, resume=resume, progress=True,
+    )  # fmt: skip
+    print(f"{result.steps} steps in {result.seconds:.0f} s, ended by {result.reason}; model: {result.model}")
+    for shard, row in result.validation.items():
+        print(f"  {shard}: IoU {row['iou_before']} -> {row['iou']}")
+
+
+def export(checkpoint: Positional[Path], out: Path | None = None) -> None:
+    """Write a trained prior as one portable ONNX file, compared with torch before it appears.
+
+    Args:
+        checkpoint: a model.safetensors.
+        out: the file to write; the checkpoint's name with .onnx if not given.
+    """
+    from .export.to_onnx import export_onnx
+
+    target = out or checkpoint.with_suffix(".onnx")
+    manifest = export_onnx(checkpoint, target)
+    print(f"{target}: {target.stat().st_size / 1e6:.2f} MB, {manifest.parameters} parameters, {manifest.body_sha256}")
+
+
+def verify(
+    onnx: Path | None = None, checkpoint: Path | None = None, cubes: int = 256, seed: int = 0, out: Path | None = None
+) -> int:
+    """State how far an ONNX file is from its checkpoint in torch; exit status 1 if too far.
+
+    Args:
+        onnx: the exported file; the shipped one if not given.
+        checkpoint: its model.safetensors; the shipped one if not given.
+        cubes: how many to compare: empty, full, random and structured ones.
+        seed: of the cubes.
+        out: also write the result as JSON here.
+    """
+    from .core.results import build_results, write_results
+    from .denoisers import WEIGHTS
+    from .export.parity import verify as run
+
+    onnx, checkpoint = onnx or WEIGHTS / "default.onnx", checkpoint or WEIGHTS / "default.safetensors"
+    report = run(onnx, checkpoint, cubes=cubes, seed=seed)
+    print(f"max error {report['max_error']:.2e}, occupancy flips {report['flip_rate']:.2e} of the voxels "
+          f"of {report['cubes']} cubes: {'passed' if report['passed'] else 'FAILED'}")  # fmt: skip
+    if out is not None:
+        write_results(out, build_results([{"method": "onnx", **report}], seeds=[seed]))
+    return 0 if report["passed"] else 1
