@@ -14,6 +14,7 @@ from __future__ import annotations
 import ast
 import copy
 import dataclasses
+import functools
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -58,6 +59,8 @@ class Options:
         steps: fit for so many steps instead.
         finetune_steps: of each of (a), (b), (c).
         resolution: density nodes of the field along an axis (.8 of it for colour); the field's defaults if left out.
+        depth_limit: farther predicted depths do not count; twice the widest camera distance if left out (the
+            paper's words; the value in its code is 2).
         denoiser: a shipped name or the path of an .onnx or .safetensors file.
         settings: of the regularizer, as name=value, e.g. dsds_weight=0.2 cubes=20.
         out: where capture.json and capture.png go.
@@ -73,6 +76,7 @@ class Options:
     steps: int | None = None
     finetune_steps: int = 300
     resolution: int | None = None
+    depth_limit: float | None = None
     denoiser: str = "default"
     settings: tuple[str, ...] = ()
     out: Path = ROOT / "docs" / "results"
@@ -85,6 +89,7 @@ class Options:
         parts += [f"--seeds {seeds} --downscale {self.downscale:g} --finetune-steps {self.finetune_steps}"]
         parts += [f"--seconds {self.seconds:g}" if self.steps is None else f"--steps {self.steps}"]
         parts += [f"--resolution {self.resolution}"] if self.resolution else []
+        parts += [f"--depth-limit {self.depth_limit:g}"] if self.depth_limit else []
         parts += [f"--denoiser {Path(self.denoiser).name}"] if self.denoiser != "default" else []
         return " ".join([*parts, *(["--settings", *self.settings] if self.settings else [])])
 
@@ -126,9 +131,9 @@ def render(field: RadianceField, cameras: Cameras) -> Views:
 
 def fit_field(options: Options, cache: FitCache, name: str, sweep: Sweep, seed: int) -> tuple[RadianceField, Any]:
     """A field fitted to a sweep, and its record."""
-    grids = {"resolution": options.resolution, "color_resolution": round(0.8 * (options.resolution or 0))}
-    config = RadianceConfig(**(grids if options.resolution else {}))
-    budget = {"seconds": options.seconds} if options.steps is None else {"steps": options.steps}
+    nodes = options.resolution
+    config = RadianceConfig(resolution=nodes, color_resolution=round(0.8 * nodes)) if nodes else RadianceConfig()
+    budget: dict[str, Any] = {"seconds": options.seconds} if options.steps is None else {"steps": options.steps}
     key = {"photos": sweep.digest(), "seed": seed, "budget": budget}
 
     def fit(field: RadianceField) -> dict[str, Any]:
@@ -161,7 +166,17 @@ def fine_tune(
     return {**render(field, evaluation.cameras), "seconds": np.array(record["seconds"])}
 
 
-def score_seed(seed: int, tuned: dict[str, Views], sweep: Sweep, pseudo: Any, visible: Any, limit: float) -> dict:
+def tuning_key(options: Options, method: str, weights: dict[str, str]) -> dict[str, Any]:
+    """What renderings after fine-tuning depend on besides the base field and the cameras."""
+    key: dict[str, Any] = {"steps": options.finetune_steps, "code": code_hash(unghost.fields)}
+    if method != "field":
+        key["regularizer"] = {**options.overrides(), "code": code_hash(unghost.regularizer)}
+    return {**key, "prior": weights} if method == "dsds" else key
+
+
+def score_seed(
+    seed: int, tuned: dict[str, Views], sweep: Sweep, pseudo: Any, visible: Any, limit: float
+) -> dict[str, dict[str, Any]]:
     """Scores of every method of one seed, on its own pixels and on those that all have."""
     shared = protocol.common_mask([visible & protocol.depth_masks(views["depth"], limit) for views in tuned.values()])
     scores = {}
@@ -186,22 +201,19 @@ def run(options: Options) -> dict[str, Any]:
     )
     denoiser = load_denoiser(options.denoiser)
     weights = {"name": denoiser.manifest.name, "sha256": denoiser.manifest.body_sha256 or file_hash(options.denoiser)}
-    cache = FitCache(options.cache)
+    cache, shown = FitCache(options.cache), dict[str, Views]()
     fits, tunes = 1 + len(options.seeds), len(options.seeds) * len(METHODS)
     guess = options.seconds if options.steps is None else options.steps * 0.3
     plan = Plan(["fit"] * fits + ["tune"] * tunes, {"fit": guess, "tune": options.finetune_steps * 0.5})
 
     plan.begin("fit", f"pseudo ground truth: {len(both.cameras)} photos of both sweeps")
     pseudo_field, pseudo_record = fit_field(options, cache, "pseudo", both, 0)
-    code = code_hash(unghost.fields)
-    pseudo_views = cache.views(
-        "pseudo", {"field": pseudo_record["sha256"], "code": code, "eval": evaluation.digest()},
-        lambda: render(pseudo_field, evaluation.cameras),
-    )  # fmt: skip
-    limit = protocol.depth_limit(train.cameras, evaluation.cameras)
+    key = {"field": pseudo_record["sha256"], "code": code_hash(unghost.fields), "eval": evaluation.digest()}
+    pseudo_views = cache.views("pseudo", key, functools.partial(render, pseudo_field, evaluation.cameras))
+    limit = options.depth_limit or protocol.depth_limit(train.cameras, evaluation.cameras)
     visible = protocol.visibility_masks(evaluation.cameras, pseudo_views["depth"], train.cameras)
 
-    records, per_seed, shown = [], [], {}
+    records, per_seed = [], []
     for seed in options.seeds:
         plan.begin("fit", f"field, seed {seed}: {len(train.cameras)} photos of {options.train}")
         base, record = fit_field(options, cache, "field", train, seed)
@@ -209,16 +221,10 @@ def run(options: Options) -> dict[str, Any]:
         tuned = {}
         for method, heading in METHODS.items():
             plan.begin("tune", f"seed {seed}, {heading}")
-            recipe = {} if method == "field" else {**overrides, "code": code_hash(unghost.regularizer)}
-            recipe.update(weights if method == "dsds" else {})
-            tuning = {"steps": options.finetune_steps, "code": code, "regularizer": recipe}
-            tuned[method] = cache.views(
-                f"{method}-{seed}", {"field": record["sha256"], "eval": evaluation.digest(), **tuning},
-                lambda base=base, seed=seed, method=method: fine_tune(
-                    options, base, train, evaluation, seed, method, denoiser
-                ),
-            )  # fmt: skip
-        shown = shown or tuned
+            key = {"field": record["sha256"], "eval": evaluation.digest(), **tuning_key(options, method, weights)}
+            make = functools.partial(fine_tune, options, base, train, evaluation, seed, method, denoiser)
+            tuned[method] = cache.views(f"{method}-{seed}", key, make)
+        shown = tuned if seed == options.seeds[0] else shown
         per_seed.append(score_seed(seed, tuned, evaluation, pseudo_views["depth"], visible, limit))
     rows = [mean_over_seeds(method, [scores[method] for scores in per_seed]) for method in METHODS]
     results = build_results(
@@ -240,7 +246,7 @@ def draw(options: Options, columns: dict[str, Views], limit: float, rows: list[d
         options.out / "capture.png", columns, views=views, limit=limit,
         title=f"{options.capture.resolve().name}: trained on {options.train}, seen from {options.eval}",
         note=f"Below each picture its depth (warm is near; grey: nothing within the depth limit). Pictures: seed "
-        f"{options.seeds[0]}. Masked PSNR at coverage, mean of {len(options.seeds)} seeds: {numbers}.",
+        f"{options.seeds[0]}. Masked PSNR at coverage, mean over seeds {list(options.seeds)}: {numbers}.",
     )  # fmt: skip
 
 

@@ -100,7 +100,7 @@ def draw_comparison(
     down = 2 * -(-len(views) // blocks)
     height, width = next(iter(columns.values()))["depth"].shape[1:]
     cell = 1.9
-    size = (cell * across + 0.6, cell * height / width * down + 1.0)
+    size = (cell * across + 0.6, cell * height / width * down + 1.1)
     figure = Figure(figsize=size, facecolor="white")
     FigureCanvasAgg(figure)
     figure.text(0.012, 1 - 0.28 / size[1], title, fontsize=13, weight="bold", va="center", color="#222222")

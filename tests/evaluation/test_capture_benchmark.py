@@ -30,6 +30,7 @@ def bench(monkeypatch):
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     module = importlib.import_module("capture")
     monkeypatch.setattr(module, "load_denoiser", lambda name: Hollow())
+    monkeypatch.setattr(module, "code_hash", lambda *packages: "this code")
     return module
 
 
@@ -77,7 +78,8 @@ def test_a_run_writes_results_and_a_figure_and_is_resumed_from_its_cache(bench, 
         assert {scores["seed"] for scores in row["per_seed"]} == {0, 1}
         assert 3 < row["psnr_visible"] < 60
         assert 0 <= row["coverage"] <= 1
-    assert Image.open(tmp_path / "out" / "capture.png").width > 600
+    with Image.open(tmp_path / "out" / "capture.png") as figure:
+        assert figure.width > 600
 
     trained = []
     original = bench.train_field
@@ -91,8 +93,25 @@ def test_a_run_writes_results_and_a_figure_and_is_resumed_from_its_cache(bench, 
     assert trained == []
     assert json.loads((tmp_path / "out" / "capture.json").read_text())["rows"] == results["rows"]
     # other settings: the bases stay, and so does fine-tuning without a regularizer
-    bench.run(_options(bench, capture, tmp_path, settings=("cubes=2", "visibility_samples=64")))
-    assert trained == [2] * 4
+    changed = ("cubes=2", "visibility_samples=64")
+    bench.run(_options(bench, capture, tmp_path, seeds=(0,), settings=changed))
+    assert trained == [2] * 2
+    # a nearer limit is a matter of scoring alone
+    near = bench.run(_options(bench, capture, tmp_path, seeds=(0,), settings=changed, depth_limit=0.1))
+    assert [row["coverage"] for row in near["rows"]] == [0.0] * 3
+    assert [row["psnr"] for row in near["rows"]] == [None] * 3
+    assert trained == [2] * 2
+
+
+def test_the_cache_knows_what_depends_on_whose_code(bench, capture, tmp_path, monkeypatch):
+    options = _options(bench, capture, tmp_path)
+    weights = {"name": "hollow", "sha256": "0"}
+    before = {method: bench.tuning_key(options, method, weights) for method in bench.METHODS}
+    same = {method: bench.tuning_key(options, method, {**weights, "sha256": "1"}) for method in bench.METHODS}
+    assert [method for method in before if before[method] == same[method]] == ["field", "visibility"]
+    monkeypatch.setattr(bench, "code_hash", lambda package: package.__name__.replace("unghost.fields", "this code"))
+    after = {method: bench.tuning_key(options, method, weights) for method in bench.METHODS}
+    assert [method for method in before if before[method] == after[method]] == ["field"]
 
 
 def test_methods_start_from_the_same_field_and_differ(bench, capture, tmp_path):
