@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 USER_ERRORS = (ValueError, TypeError, OSError, ImportError)
 USAGE_EXIT, INTERRUPTED_EXIT = 2, 130
@@ -23,7 +24,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     from . import commands, commands_prior
 
-    verbs = {
+    verbs: dict[str, Callable[..., Any]] = {
         "demo": commands.demo,
         "clean": commands.clean,
         "bench": commands.bench,
@@ -36,7 +37,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     verb = next((word for word in words if word in verbs), "")
     try:
-        status = tyro.extras.subcommand_cli_from_dict(
+        status: int | None = tyro.extras.subcommand_cli_from_dict(
             verbs, prog="unghost", args=words, description="Take ghosts out of radiance fields."
         )
     except USER_ERRORS as error:

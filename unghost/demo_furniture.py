@@ -102,6 +102,14 @@ def _lamp() -> list[Solid]:
     ]
 
 
+def _stem(points: NDArray[np.float64]) -> Solid:
+    return Solid((0.22, 0.42, 0.16), lambda p: sd.polyline_tube(p, points, 0.018))
+
+
+def _leaf(color: Any, at: Any, turn: float) -> Solid:
+    return Solid(color, lambda p: sd.ellipsoid(_place(p, at, turn), (0.16, 0.075, 0.045)))
+
+
 def _plant(rng: np.random.Generator) -> list[Solid]:
     x, y = 1.95, 0.75
     solids = [Solid((0.70, 0.38, 0.26), lambda p: sd.cylinder(_place(p, (x, y, 0.2)), 0.2, 0.2))]
@@ -110,14 +118,7 @@ def _plant(rng: np.random.Generator) -> list[Solid]:
         tip = (x + lean * np.cos(angle), y + lean * np.sin(angle), rng.uniform(0.75, 1.3))
         middle = (x + 0.3 * lean * np.cos(angle), y + 0.3 * lean * np.sin(angle), 0.62)
         stem = np.array([(x, y, 0.38), middle, tip])
-        solids.append(Solid((0.22, 0.42, 0.16), lambda p, stem=stem: sd.polyline_tube(p, stem, 0.018)))
-        leaf = (*tip, angle)
-        solids.append(
-            Solid(
-                (0.20 + 0.1 * rng.random(), 0.5, 0.2),
-                lambda p, leaf=leaf: sd.ellipsoid(_place(p, leaf[:3], leaf[3]), (0.16, 0.075, 0.045)),
-            )
-        )
+        solids += [_stem(stem), _leaf((0.20 + 0.1 * rng.random(), 0.5, 0.2), tip, angle)]
     return solids
 
 

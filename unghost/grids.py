@@ -89,7 +89,7 @@ def load_grid(path: str | Path) -> tuple[NDArray[np.float32], NDArray[np.float64
     """
     source = Path(path)
     try:
-        with np.load(source, allow_pickle=False) as archive:
+        with source.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in ("density", "aabb") if name in archive}
     except FileNotFoundError:
         raise FileNotFoundError(f"load_grid: no file {source}") from None

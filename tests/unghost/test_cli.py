@@ -1,0 +1,123 @@
+import numpy as np
+import pytest
+
+from unghost import cli, commands
+from unghost.commands_prior import expand_shards
+from unghost.core.shards import pack_labels, write_shard
+from unghost.grids import load_grid, save_grid
+
+VERBS = ("demo", "clean", "bench", "curate", "harvest", "train", "export", "verify")
+
+
+def small_shard(folder, count):
+    write_shard(
+        folder,
+        {
+            "inputs": np.zeros((count, 32, 32, 32), dtype=np.uint8),
+            "labels": pack_labels(np.zeros((count, 32, 32, 32), dtype=np.uint8)),
+            "severity": np.zeros(count, dtype=np.float32),
+            "edge_fraction": np.full(count, 0.1, dtype=np.float32),
+            "group": np.zeros(count, dtype=np.int32),
+        },
+        {},
+    )
+
+
+@pytest.mark.parametrize("words", [[], *([verb] for verb in VERBS)])
+def test_help_reads_well(words, capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main([*words, "--help"])
+    assert stop.value.code == 0
+    text = capsys.readouterr().out
+    assert f"usage: unghost {words[0] if words else ''}".rstrip() in text
+    if not words:
+        assert all(verb in text for verb in VERBS)
+
+
+@pytest.mark.parametrize("words", [[], ["nope"], ["demo", "--nope"], ["bench", "--batch", "many"]])
+def test_wrong_words_exit_with_two(words, capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(words)
+    assert stop.value.code == 2
+    assert capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["clean", "absent.npz"], "unghost clean: load_grid: no file absent.npz"),
+        (["curate", "absent", "--out", "x"], "unghost curate: load_recipe: absent is neither a file"),
+        (["curate", "procedural", "--out", "x", "--count", "0"], "unghost curate: curate: count must be >= 1, got 0"),
+        (["train", "absent", "--out", "x"], "unghost train: expand_shards: absent is not a shard and holds none"),
+        (["train", "absent=much", "--out", "x"], "must be FOLDER or FOLDER=WEIGHT"),
+        (["demo", "--seed", "-1"], "unghost demo: "),
+        (["bench", "--denoiser", "absent.onnx"], "unghost bench: load_denoiser: no file absent.onnx"),
+        (["verify", "--onnx", "a.onnx", "--checkpoint", "b.safetensors"], "unghost verify: "),
+        (["export", "absent.safetensors"], "unghost export: "),
+    ],
+)
+def test_what_the_user_can_mend_is_one_line(words, message, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(words) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert "Traceback" not in error
+    assert not list(tmp_path.iterdir())
+
+
+def test_our_own_missing_module_is_not_blamed_on_the_user(monkeypatch):
+    def broken(out: str = "x") -> None:
+        """Break."""
+        raise ModuleNotFoundError("No module named 'unghost.gone'", name="unghost.gone")
+
+    monkeypatch.setattr(commands, "demo", broken)
+    with pytest.raises(ModuleNotFoundError):
+        cli.main(["demo"])
+
+
+def test_interrupts_are_quiet(monkeypatch, capsys):
+    def interrupted() -> None:
+        """Stop."""
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(commands, "demo", interrupted)
+    assert cli.main(["demo"]) == 130
+    assert capsys.readouterr().err == "unghost demo: interrupted\n"
+
+
+def test_curate_writes_shards(tmp_path, capsys):
+    assert cli.main(["curate", "procedural", "--out", str(tmp_path / "pairs"), "--count", "3"]) == 0
+    assert "3 pairs in 1 shard under" in capsys.readouterr().out
+    assert expand_shards(f"{tmp_path / 'pairs'}=2") == [(tmp_path / "pairs" / "shard-00000", 2.0)]
+
+
+def test_shards_of_a_folder_share_its_weight_by_length(tmp_path):
+    for index, count in enumerate((1, 3)):
+        small_shard(tmp_path / f"s{index}", count)
+    (tmp_path / "s2.partial").mkdir()
+    assert expand_shards(f"{tmp_path}=2") == [(tmp_path / "s0", 0.5), (tmp_path / "s1", 1.5)]
+    assert expand_shards(str(tmp_path / "s1")) == [(tmp_path / "s1", 1.0)]
+
+
+@pytest.mark.parametrize("weight", ["0", "-1", "inf", "nan"])
+def test_impossible_weights_are_refused(weight):
+    with pytest.raises(ValueError, match="must be finite and > 0"):
+        expand_shards(f"x={weight}")
+
+
+def test_grid_files_round_trip_and_refuse(tmp_path):
+    path, box = tmp_path / "g.npz", np.array([[0.0, 0, 0], [1, 2, 3]])
+    save_grid(path, np.ones((2, 4, 6)), box)
+    density, found = load_grid(path)
+    assert density.shape == (2, 4, 6)
+    np.testing.assert_array_equal(found, box)
+    path.write_bytes(path.read_bytes()[:-40])
+    with pytest.raises(ValueError, match=r"g\.npz is not an \.npz file, or is truncated"):
+        load_grid(path)
+    np.savez(path, density=np.ones((2, 2, 2)))
+    with pytest.raises(ValueError, match="lacks aabb"):
+        load_grid(path)
+    np.savez(path, density=np.ones(3), aabb=box)
+    with pytest.raises(ValueError, match=r"must have shape \(X, Y, Z\), got \(3,\)"):
+        load_grid(path)
