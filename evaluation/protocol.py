@@ -153,7 +153,7 @@ def score(
         result["psnr_common"] = _mean_psnr(colours, photos, common)
         result["coverage_common"] = metrics.coverage(common)
     result["views_scored"] = int(masks.any(axis=(1, 2)).sum())
-    result["convention"] = f"paper masks (visible, depth < limit), means over views, ssim {ssim_convention}"
+    result["convention"] = f"paper masks (visible, depth < {limit:.4g}), means over views, ssim {ssim_convention}"
     return result
 
 

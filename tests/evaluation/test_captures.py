@@ -1,6 +1,7 @@
 import json
 import math
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -242,3 +243,10 @@ def test_the_real_capture():
     images = capture.images(capture.split("trajectory_1")[:2])
     assert images.shape == (2, 94, 126, 3)
     assert 0.1 < images.mean() < 0.9
+
+
+def test_without_pillow_the_extra_is_named(tmp_path, monkeypatch):
+    _write(tmp_path / "c")
+    monkeypatch.setitem(sys.modules, "PIL", None)
+    with pytest.raises(ImportError, match=r"pip install unghost\[eval\]"):
+        load_capture(tmp_path / "c")

@@ -103,6 +103,7 @@ def test_a_perfect_rendering_scores_perfectly():
     assert found["normal_pct_30"] == 1
     assert found["coverage"] == pytest.approx((visible & (pseudo < LIMIT)).mean())
     assert found["views_scored"] == 2
+    assert found["convention"] == "paper masks (visible, depth < 6), means over views, ssim map_mean"
 
 
 def test_scores_are_means_over_views_of_the_metrics():

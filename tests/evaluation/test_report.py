@@ -1,3 +1,5 @@
+import sys
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -70,3 +72,9 @@ def test_depth_colours_are_warm_when_near_and_grey_beyond_the_limit():
     assert painted[0, 0, 0] > painted[0, 0, 2]  # red over blue
     assert painted[0, 1, 0] < painted[0, 1, 2] + 0.05
     np.testing.assert_allclose(painted[0, 2], 0.55)
+
+
+def test_without_matplotlib_the_extra_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(ImportError, match=r"pip install unghost\[eval\]"):
+        report.draw_comparison(tmp_path / "a.png", {}, views=[0], limit=1.0, title="t")
