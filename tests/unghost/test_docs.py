@@ -1,0 +1,37 @@
+"""What the documents promise is what the code has."""
+
+import dataclasses
+import re
+from pathlib import Path
+
+import pytest
+
+from unghost import cli
+from unghost.core.manifest import CHANNEL_NAMES, FORMAT, METADATA_KEY, Manifest
+from unghost.core.shards import ARRAYS
+from unghost.core.shards import FORMAT as SHARD_FORMAT
+
+ROOT = Path(__file__).resolve().parents[2]
+FORMATS = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
+
+
+def test_every_key_of_the_formats_is_documented():
+    words = [item.name for item in dataclasses.fields(Manifest)] + list(CHANNEL_NAMES) + [FORMAT, METADATA_KEY]
+    words += [f"{name}.npy" for name in ARRAYS] + [SHARD_FORMAT]
+    assert [word for word in words if not re.search(rf"[`\"]{re.escape(word)}[`\"]", FORMATS)] == []
+
+
+@pytest.mark.parametrize("name", ["README.md", "CHANGELOG.md", "docs/conventions.md", "docs/formats.md"])
+def test_links_between_documents_lead_somewhere(name):
+    path = ROOT / name
+    for target in re.findall(r"\]\(([^)#]+)\)", path.read_text(encoding="utf-8")):
+        if not target.startswith("https://"):
+            assert (path.parent / target).exists(), target
+
+
+def test_every_verb_is_in_the_readme(capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["--help"])
+    verbs = re.search(r"\{([a-z,]+)\}", capsys.readouterr().out).group(1).split(",")
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert [verb for verb in verbs if f"`unghost {verb}" not in readme] == []
