@@ -93,8 +93,9 @@ def _manifest(trainer: Trainer, training: dict[str, Any], threshold: float = 0.0
 
 
 def _validate(trainer: Trainer, shards: Mapping[str, Shard], limit: int | None) -> dict[str, dict[str, Any]]:
+    """Scores of the averaged weights: quick and in the training's precision with a limit, else all and in fp32."""
     denoiser = TorchDenoiser(trainer.averaged_network(), _manifest(trainer, {}))
-    with torch.autocast(trainer.device.type, dtype=torch.bfloat16, enabled=trainer.bf16):
+    with torch.autocast(trainer.device.type, dtype=torch.bfloat16, enabled=trainer.bf16 and limit is not None):
         return {name: evaluate(denoiser, shard, limit=limit) for name, shard in shards.items()}
 
 

@@ -1,0 +1,99 @@
+import numpy as np
+import pytest
+
+from unghost.core.shards import dequantize_signed, read_shard, unpack_labels, write_shard
+from unghost.prior.batches import SYMMETRIES, Mixture, apply_symmetry
+
+
+def test_symmetries_are_the_48_of_the_cube():
+    grid = np.arange(27).reshape(3, 3, 3)
+    images = {apply_symmetry(grid, index).tobytes() for index in range(len(SYMMETRIES))}
+    assert len(images) == 48
+    assert np.array_equal(apply_symmetry(grid, 0), grid)
+
+
+def test_symmetries_keep_the_distance_to_the_centre():
+    axis = np.arange(4) - 1.5
+    radius = axis[:, None, None] ** 2 + axis[:, None] ** 2 + axis**2
+    for index in range(48):
+        assert np.array_equal(apply_symmetry(radius, index), radius)
+
+
+def test_input_and_label_move_together(shard_paths):
+    """The clean cubes' inputs are their labels, whatever the symmetry."""
+    batch = Mixture([(shard_paths["a"], 1.0)], seed=0).batch(0, 40)
+    occupied = batch.channels[:, 0] > 0
+    clean = [index for index in range(40) if np.array_equal(np.unique(batch.channels[index]), [-1.0, 1.0])]
+    assert len(clean) >= 3
+    for index in clean:
+        assert np.array_equal(occupied[index], batch.labels[index] == 1)
+
+
+def test_types_shapes_and_range_of_timesteps(shard_paths):
+    batch = Mixture([(shard_paths["a"], 1.0), (shard_paths["b"], 1.0)], seed=0).batch(5, 4)
+    assert batch.channels.shape == (4, 1, 32, 32, 32)
+    assert batch.channels.dtype == np.float32
+    assert batch.labels.shape == (4, 32, 32, 32)
+    assert batch.labels.dtype == np.uint8
+    assert batch.timestep.dtype == np.int64
+    assert batch.edge_fraction.dtype == np.float32
+
+
+def test_a_sample_depends_on_seed_and_index_alone(shard_paths):
+    shards = [(shard_paths["a"], 1.0), (shard_paths["b"], 2.0)]
+    mixture, other = Mixture(shards, seed=1), Mixture(shards, seed=2)
+    large, small = mixture.batch(0, 6), mixture.batch(2, 2)  # samples 0..5 and 4..5
+    assert np.array_equal(large.channels[4:], small.channels)
+    assert np.array_equal(large.labels[4:], small.labels)
+    assert np.array_equal(large.timestep[4:], small.timestep)
+    assert not np.array_equal(other.batch(0, 6).timestep, large.timestep)
+
+
+def test_stream_equals_random_access_and_starts_anywhere(shard_paths):
+    mixture = Mixture([(shard_paths["a"], 1.0)], seed=4)
+    stream = mixture.stream(3, 2)
+    for step in (3, 4, 5):
+        assert np.array_equal(next(stream).channels, mixture.batch(step, 2).channels)
+    stream.close()
+
+
+def test_timesteps_lie_between_severity_and_the_end(shard_paths):
+    shard = read_shard(shard_paths["a"])
+    mixture = Mixture([(shard_paths["a"], 1.0)], seed=0)
+    times = {index: [] for index in range(len(shard))}
+    for index in range(400):
+        _, cube, _, _ = mixture._draw(index)
+        times[cube].append(int(mixture.batch(index, 1).timestep[0]))
+    for cube, drawn in times.items():
+        assert min(drawn) >= np.rint(999 * shard.severity[cube])
+        assert max(drawn) <= 999
+    assert min(times[0]) < 200  # severity 0: seen at every timestep
+    assert max(times[0]) > 800
+
+
+def test_weights_of_the_mixture(shard_paths):
+    mixture = Mixture([(shard_paths["a"], 1.0), (shard_paths["b"], 3.0)], seed=0)
+    share = np.mean([mixture._draw(index)[0] is mixture.shards[1] for index in range(2000)])
+    assert share == pytest.approx(0.75, abs=0.04)
+
+
+def test_values_come_from_the_shard(shard_paths):
+    shard = read_shard(shard_paths["b"])
+    mixture = Mixture([(shard_paths["b"], 1.0)], seed=0)
+    _, cube, symmetry, _ = mixture._draw(9)
+    batch = mixture.batch(9, 1)
+    assert np.array_equal(batch.channels[0, 0], apply_symmetry(dequantize_signed(shard.inputs[cube]), symmetry))
+    assert np.array_equal(batch.labels[0], apply_symmetry(unpack_labels(shard.labels[cube : cube + 1])[0], symmetry))
+    assert batch.edge_fraction[0] == shard.edge_fraction[cube]
+
+
+def test_errors(shard_paths, tmp_path):
+    with pytest.raises(ValueError, match="at least one"):
+        Mixture([], seed=0)
+    with pytest.raises(ValueError, match="weights must be finite and > 0"):
+        Mixture([(shard_paths["a"], 0.0)], seed=0)
+    shard = read_shard(shard_paths["a"])
+    names = ("inputs", "labels", "severity", "edge_fraction", "group")
+    write_shard(tmp_path / "none", {name: getattr(shard, name)[:0] for name in names}, {})
+    with pytest.raises(ValueError, match="holds no cubes"):
+        Mixture([(tmp_path / "none", 1.0)], seed=0)
