@@ -44,6 +44,7 @@ class CleanSettings:
         faint: cells that are not occupied but hold more than this share of the rule's threshold are judged too; 1
             leaves them alone. One is removed if voted empty and not next to an occupied cell that stays.
         smallest: connected pieces that stay must have this many cells.
+        fringe: occupied cells this near (in cells) to one that stays, stay: the soft skirt of a surface.
         speck: fewer connected cells than this, voted empty on something that stays, are kept.
         keep_boxes: ``(2, 3)`` boxes in which nothing is removed (thin or transparent things).
         skip_empty: do not send windows in which nothing is to be judged; never changes the mask.
@@ -64,6 +65,7 @@ class CleanSettings:
     faint: float = 0.1
     smallest: int = 27
     speck: int = 8
+    fringe: int = 1
     keep_boxes: tuple[Any, ...] = ()
     skip_empty: bool = True
     drop_invalid: bool = False
@@ -84,6 +86,7 @@ class CleanSettings:
             "faint": (0.0 < self.faint <= 1.0, "in (0, 1]"),
             "smallest": (self.smallest >= 0, ">= 0"),
             "speck": (self.speck >= 0, ">= 0"),
+            "fringe": (self.fringe >= 0, ">= 0"),
             "chunk": (self.chunk >= 1, ">= 1"),
         }
         for name, (holds, rule) in rules.items():
@@ -154,7 +157,8 @@ def clean(
     score, windows = _score(survey, denoiser, s, pitch / scene_extent(box), progress)
     threshold = threshold_of(s.strength, denoiser.manifest.removal_threshold)
     removed, faint = decide(
-        survey.occupied, survey.judged, score, threshold=threshold, smallest=s.smallest, speck=s.speck
+        survey.occupied, survey.judged, score,
+        threshold=threshold, smallest=s.smallest, speck=s.speck, fringe=s.fringe,
     ) if s.strength > 0 else (np.zeros(shape, bool), np.zeros(shape, bool))  # fmt: skip
     removed, faint = removed & ~survey.protected, faint & ~survey.protected
     regions, region_count = removed_regions(removed, score, lattice_origin(box, pitch, shape), pitch)

@@ -17,7 +17,14 @@ MOST_REGIONS = 100  # listed in a summary
 
 
 def decide(
-    occupied: Mask, judged: Mask, score: NDArray[np.float32], *, threshold: float, smallest: int, speck: int
+    occupied: Mask,
+    judged: Mask,
+    score: NDArray[np.float32],
+    *,
+    threshold: float,
+    smallest: int,
+    speck: int,
+    fringe: int = 0,
 ) -> tuple[Mask, Mask]:
     """Which cells to remove.
 
@@ -26,7 +33,9 @@ def decide(
        the scene: then cells are judged one by one.
     3. Fewer than ``speck`` connected cells voted empty, on something that stays, are pores of a solid: they stay.
     4. What is left over in pieces of fewer than ``smallest`` cells goes.
-    5. A faint cell (judged, not occupied) goes if voted empty and not next to an occupied cell that stays.
+    5. Cells voted empty within ``fringe`` cells of one that stays are the soft skirt of a surface (in a trained field
+       half of a surface's occupied cells hold little): they stay.
+    6. A faint cell (judged, not occupied) goes if voted empty and not next to an occupied cell that stays.
 
     Args:
         occupied: ``(X, Y, Z)`` bool.
@@ -35,6 +44,7 @@ def decide(
         threshold: see 1.
         smallest: see 4, cells.
         speck: see 3, cells.
+        fringe: see 5, cells.
 
     Returns:
         removed occupied cells, removed faint cells, both ``(X, Y, Z)`` bool.
@@ -48,6 +58,8 @@ def decide(
     removed = voted | whole[labels]
     removed &= ~_small_pieces(removed & ~whole[labels], speck)
     removed |= _small_pieces(occupied & ~removed, smallest)
+    for _ in range(fringe):
+        removed &= ~dilate(occupied & ~removed)
     stays = dilate(occupied & ~removed)
     return removed, judged & ~occupied & (score < threshold) & ~stays
 

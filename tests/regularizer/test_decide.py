@@ -56,6 +56,16 @@ def test_faint_cells_go_unless_they_touch_what_stays():
     assert not faint[7:13, 7:13, 9:15].any()
 
 
+def test_the_soft_skirt_of_what_stays_stays():
+    occupied, score = scene()
+    score[:, :, 1:3] = -0.5  # two of the floor's three layers
+    score[8:12, 8:12, 10:14] = -0.5
+    for fringe, layers in ((0, 2), (1, 1), (2, 0)):
+        removed, _ = decide(occupied, occupied, score, threshold=0.0, smallest=27, speck=8, fringe=fringe)
+        assert removed[:, :, :3].sum() == 400 * layers
+        assert removed[8:12, 8:12, 10:14].all()
+
+
 def test_regions_by_hand():
     removed = np.zeros((6, 6, 6), bool)
     removed[0:2, 0:2, 0:2] = removed[5, 5, 4:6] = True
