@@ -18,17 +18,27 @@ from .network import NetworkConfig, RestorationNet
 CONFIG_KEY = "unghost_network"
 
 
+def _ordered(data: bytes) -> bytes:
+    """The same safetensors file with its header's keys sorted: equal contents, equal bytes, equal hashes."""
+    end = 8 + int.from_bytes(data[:8], "little")
+    header = json.dumps(json.loads(data[8:end]), sort_keys=True, separators=(",", ":")).encode()
+    header += b" " * (-len(header) % 8)
+    return len(header).to_bytes(8, "little") + header + data[end:]
+
+
 def write_tensors(path: str | Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
-    """Write a safetensors file, whole or not at all."""
+    """Write a safetensors file, whole or not at all; equal contents give equal bytes."""
     try:
-        from safetensors.torch import save_file
+        from safetensors.torch import save
     except ImportError:
         raise ImportError("write_tensors: needs safetensors: pip install unghost[torch]") from None
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
     partial = target.with_name(target.name + ".partial")
-    save_file({name: value.detach().cpu().contiguous() for name, value in tensors.items()}, partial, dict(metadata))
-    with partial.open("rb+") as stream:
+    plain = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
+    with partial.open("wb") as stream:
+        stream.write(_ordered(save(plain, dict(metadata))))
+        stream.flush()
         os.fsync(stream.fileno())
     os.replace(partial, target)
 

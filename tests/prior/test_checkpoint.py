@@ -71,7 +71,7 @@ def test_truncated_foreign_and_missing_files_are_refused(saved, tmp_path):
     for length in (0, 4, 100, len(data) // 2, len(data) - 1):
         broken = tmp_path / "broken.safetensors"
         broken.write_bytes(data[:length])
-        with pytest.raises(ValueError, match="broken.safetensors is truncated or not a safetensors file"):
+        with pytest.raises(ValueError, match=r"broken\.safetensors is truncated or not a safetensors file"):
             load_model(broken)
     (tmp_path / "text.safetensors").write_text("hello, this is no model")
     with pytest.raises(ValueError, match="not a safetensors"):
