@@ -1,0 +1,256 @@
+"""Harvested pairs: cubes of badly constrained fields, beside the truth of the scenes they were fitted to.
+
+A radiance field is fitted to a few photos of a synthetic scene; cubes of its opacity are inputs, the
+scene's signed distance gives three-valued labels:
+
+    surface  within three quarters of a field cell of a surface that some training photo sees
+    free     more than one and a half cells outside every solid: whatever is opaque there is a ghost
+    ignore   inside solids and walls, surfaces that no photo sees, the band between, outside the box
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.aabb import contains, scene_extent
+from ..core.frames import RESOLUTION, cube_lattices, random_rotations
+from ..core.occupancy import (
+    DEFAULT_OPACITY_THRESHOLD,
+    EMPTY,
+    FREE_LABEL,
+    IGNORE_LABEL,
+    SURFACE_LABEL,
+    opacity_from_density,
+    opacity_from_signed,
+    signed_from_opacity,
+)
+from ..core.shards import pack_labels, quantize_signed, read_shard, write_shard
+
+if TYPE_CHECKING:
+    from ..fields.radiance import RadianceField
+    from ..fields.scenes import PhotographedScene
+    from ..fields.solids import SolidScene
+
+SURFACE_BAND, FREE_BAND = 0.75, 1.5  # in field cells
+
+
+@dataclass(frozen=True)
+class HarvestConfig:
+    """What a harvest varies, each value drawn per scene.
+
+    Attributes:
+        resolutions: density nodes along an axis of the contracted cube.
+        photos, photo_width: how many photos a field sees, and their width in pixels (4:3).
+        steps: fitting steps, log-uniform; cubes are also taken after a quarter of them.
+        rays: rays a step.
+        cubes: cubes per snapshot (two snapshots a scene).
+        voxel_pitch: voxel side in field cells, log-uniform.
+        rotated_share: share of cubes with a random rotation.
+    """
+
+    resolutions: tuple[int, ...] = (64, 80, 96, 112, 128, 160)
+    photos: tuple[int, int] = (10, 30)
+    photo_width: tuple[int, int] = (72, 120)
+    steps: tuple[int, int] = (250, 1000)
+    rays: int = 1536
+    cubes: int = 140
+    voxel_pitch: tuple[float, float] = (0.5, 1.25)
+    rotated_share: float = 0.5
+
+
+def _distances(scene: SolidScene, points: NDArray[np.float64], margin: float, aabb: NDArray[np.float64]) -> Any:
+    """Signed distance of ``points (N, 3)``, exact where it is at most ``margin``, else a value beyond the margin.
+
+    A coarse grid of exact distances settles most points: a signed distance changes by no more than one goes.
+    """
+    nodes = 96
+    axes = [np.linspace(aabb[0, axis], aabb[1, axis], nodes) for axis in range(3)]
+    coarse = scene.signed_distance(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1))
+    cell = (aabb[1] - aabb[0]) / (nodes - 1)
+    index = np.clip(np.rint((points - aabb[0]) / cell), 0, nodes - 1).astype(np.int64)
+    distance = coarse[index[:, 0], index[:, 1], index[:, 2]]
+    slack = np.linalg.norm(points - (aabb[0] + index * cell), axis=1)
+    close = np.flatnonzero(np.abs(distance) - slack <= margin)
+    distance[close] = scene.signed_distance(points[close])
+    return distance
+
+
+def label_positions(
+    photographed: PhotographedScene, positions: NDArray[np.float64], field_pitch: float, aabb: NDArray[np.float64]
+) -> NDArray[np.uint8]:
+    """Three-valued labels ``(...)`` of world ``positions (..., 3)``; see the module's text."""
+    flat = positions.reshape(-1, 3)
+    distance = _distances(photographed.scene, flat, FREE_BAND * field_pitch, aabb)
+    labels = np.full(len(flat), IGNORE_LABEL, dtype=np.uint8)
+    labels[distance > FREE_BAND * field_pitch] = FREE_LABEL
+    near = np.flatnonzero(np.abs(distance) <= SURFACE_BAND * field_pitch)
+    relaxed = photographed.depth_maps + 2.0 * field_pitch
+    seen = photographed.true_cameras.view_count(flat[near], depth_maps=relaxed, tolerance=0.02) > 0
+    labels[near[seen]] = SURFACE_LABEL
+    labels[~contains(aabb, flat)] = IGNORE_LABEL
+    return labels.reshape(positions.shape[:-1])
+
+
+def severity_of(inputs: NDArray[np.float32], labels: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """One minus the IoU of opaque input and surface label over voxels that count: ``(N,)`` in [0, 1]."""
+    valid = labels != IGNORE_LABEL
+    opaque = (opacity_from_signed(inputs) > DEFAULT_OPACITY_THRESHOLD) & valid
+    surface = labels == SURFACE_LABEL
+    union = (opaque | surface).sum(axis=(1, 2, 3))
+    both = (opaque & surface).sum(axis=(1, 2, 3))
+    return (1.0 - np.where(union > 0, both / np.maximum(union, 1), 1.0)).astype(np.float32)
+
+
+def _propose(rng: np.random.Generator, field: RadianceField, count: int) -> NDArray[np.float64]:
+    """Cube centres ``(count, 3)`` in the field's box: nine in ten where it is opaque, the rest anywhere."""
+    import torch
+
+    aabb = field.aabb
+    candidates = rng.uniform(aabb[0], aabb[1], size=(60000, 3))
+    with torch.no_grad():
+        density = field.density_fn(torch.from_numpy(candidates).float()).numpy()[:, 0]
+    opacity = opacity_from_density(density, field.field_pitch)
+    weight = np.where(opacity > DEFAULT_OPACITY_THRESHOLD, 1.0, 0.02 * opacity) + 1e-6
+    chosen = rng.choice(len(candidates), size=count, p=weight / weight.sum())
+    anywhere = rng.random(count) < 0.1
+    chosen[anywhere] = rng.integers(len(candidates), size=int(anywhere.sum()))
+    return candidates[chosen]
+
+
+def harvest_cubes(
+    rng: np.random.Generator, field: RadianceField, photographed: PhotographedScene, config: HarvestConfig
+) -> dict[str, NDArray[Any]]:
+    """Cut ``config.cubes`` cubes out of a fitted field and label them: a shard's arrays, less ``group``."""
+    import torch
+
+    count = config.cubes
+    centers = _propose(rng, field, count)
+    pitches = field.field_pitch * np.exp(rng.uniform(*np.log(config.voxel_pitch), size=count))
+    edges = pitches * RESOLUTION
+    rotations = random_rotations(rng, count)
+    rotations[rng.random(count) >= config.rotated_share] = np.eye(3)
+    lattice = cube_lattices(centers, edges, rotations)
+    with torch.no_grad():
+        density = field.density_fn(torch.from_numpy(lattice).float()).numpy()[..., 0]
+    assumed_pitch = field.field_pitch * np.exp(rng.uniform(-0.3, 0.3, size=(count, 1, 1, 1)))
+    inputs = signed_from_opacity(opacity_from_density(density, assumed_pitch)).astype(np.float32)
+    inputs[~contains(field.aabb, lattice)] = EMPTY
+    labels = label_positions(photographed, lattice, field.field_pitch, field.aabb)
+    return {
+        "inputs": quantize_signed(inputs),
+        "labels": pack_labels(labels),
+        "severity": severity_of(inputs, labels),
+        "edge_fraction": (edges / scene_extent(field.aabb)).astype(np.float32),
+    }
+
+
+def harvest_scene(seed: int, index: int, config: HarvestConfig) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    """Build, photograph, fit and cut scene ``index``: shard arrays and provenance. Depends on (seed, index) alone."""
+    import torch
+
+    from ..fields.radiance import RadianceConfig, RadianceField
+    from ..fields.rendering import Sampling
+    from ..fields.scenes import photograph, random_scene
+    from ..fields.training import TrainingConfig, train_field
+
+    rng = np.random.default_rng([seed, index])
+    width = int(rng.integers(config.photo_width[0], config.photo_width[1] + 1))
+    photos = int(rng.integers(config.photos[0], config.photos[1] + 1))
+    photographed = photograph(rng, random_scene(rng), count=photos, width=width, height=width * 3 // 4)
+    resolution = int(rng.choice(config.resolutions))
+    steps = int(np.exp(rng.uniform(*np.log(config.steps))))
+    torch.manual_seed(seed * 1_000_003 + index)
+    opacity = float(np.exp(rng.uniform(np.log(0.002), np.log(0.03))))
+    field = RadianceField(RadianceConfig(resolution, max(48, resolution * 3 // 4), opacity))
+    samples = max(48, round(2.4 / field.field_pitch))
+    fitting = TrainingConfig(
+        rays=config.rays,
+        distortion_weight=float(rng.choice([0.0, 0.002, 0.01])),
+        sampling=Sampling(near_samples=samples, far_samples=max(12, samples // 4)),
+    )
+    parts = []
+    early = max(60, steps // 4)
+    for fine_tune, budget in ((False, early), (True, steps - early)):
+        report = train_field(
+            field,
+            photographed.cameras,
+            photographed.images,
+            steps=budget,
+            seed=index,
+            config=fitting,
+            fine_tune=fine_tune,
+        )
+        parts.append(harvest_cubes(rng, field, photographed, config))
+    arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    arrays["group"] = np.full(len(arrays["inputs"]), index, dtype=np.int32)
+    provenance = {
+        "recipe": "harvest", "seed": seed, "scene": index, "photos": photos, "photo_width": width, "steps": steps,
+        "field": "dense grid", "resolution": resolution, "psnr": round(float(report["psnr"]), 3),
+        "config": dataclasses.asdict(config), "licence": "generated",
+    }  # fmt: skip
+    return arrays, provenance
+
+
+def _work(folder: str, seed: int, index: int, config: HarvestConfig) -> tuple[int, str]:
+    import torch
+
+    torch.set_num_threads(1)
+    try:
+        arrays, provenance = harvest_scene(seed, index, config)
+    except RuntimeError as error:  # a scene without a free path; reported, not fatal
+        return index, str(error)
+    write_shard(Path(folder) / f"scene-{index:05d}", arrays, provenance)
+    return index, ""
+
+
+def harvest(
+    out: str | Path,
+    *,
+    scenes: int,
+    seed: int = 0,
+    first: int = 0,
+    workers: int = 1,
+    config: HarvestConfig | None = None,
+    progress: bool = False,
+    log: Callable[[str], None] | None = None,
+) -> int:
+    """Harvest scenes ``first .. first + scenes - 1``, one shard each; those already there are skipped.
+
+    A run can be killed at any time and started again. ``log`` hears of scenes that were given up.
+
+    Returns:
+        The number of pairs now in ``out``.
+    """
+    from tqdm import tqdm
+
+    folder, config = Path(out), config or HarvestConfig()
+    if scenes < 1 or workers < 1:
+        raise ValueError(f"harvest: scenes and workers must be >= 1, got {scenes} and {workers}")
+    folder.mkdir(parents=True, exist_ok=True)
+    todo = [index for index in range(first, first + scenes) if not (folder / f"scene-{index:05d}").exists()]
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    started = time.perf_counter()
+    with (
+        ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool,
+        tqdm(total=len(todo), disable=not progress, unit="scene") as bar,
+    ):
+        for index, problem in (
+            pool.map(_work, *zip(*((str(folder), seed, index, config) for index in todo))) if todo else ()
+        ):
+            if problem and log is not None:
+                log(f"scene {index}: {problem}")
+            bar.update(1)
+    if log is not None:
+        log(f"{len(todo)} scenes in {time.perf_counter() - started:.0f} s")
+    return sum(len(read_shard(path)) for path in sorted(folder.glob("scene-*")) if path.suffix != ".partial")

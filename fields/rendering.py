@@ -1,0 +1,132 @@
+"""Volume rendering of a :class:`RadianceField`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..core.cameras import Cameras
+from .radiance import RadianceField
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """Where samples lie along a ray: evenly up to ``middle``, then evenly in inverse distance to ``far``.
+
+    Attributes:
+        near, middle, far: distances in scene units.
+        near_samples, far_samples: how many in either part.
+        minimal_weight: samples below this rendering weight get no colour lookup (their density still counts).
+    """
+
+    near: float = 0.05
+    middle: float = 2.4
+    far: float = 100.0
+    near_samples: int = 112
+    far_samples: int = 32
+    minimal_weight: float = 1e-3
+
+    def edges(self) -> Tensor:
+        """``(samples + 1,)`` interval edges, ascending."""
+        inner = torch.linspace(self.near, self.middle, self.near_samples + 1)
+        if not self.far_samples:
+            return inner
+        outer = 1.0 / torch.linspace(1.0 / self.middle, 1.0 / self.far, self.far_samples + 1)
+        return torch.cat([inner, outer[1:]])
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """Per ray: ``rgb (N, 3)`` without background, ``weights (N, S)``, ``edges (N, S + 1)`` distances."""
+
+    rgb: Tensor
+    weights: Tensor
+    edges: Tensor
+    positions: Tensor
+    density: Tensor
+
+    @property
+    def accumulation(self) -> Tensor:
+        """``(N,)`` in [0, 1]."""
+        return self.weights.sum(dim=1)
+
+
+def render_rays(
+    field: RadianceField,
+    origins: Tensor,
+    directions: Tensor,
+    sampling: Sampling,
+    *,
+    generator: torch.Generator | None = None,
+    occupied: Tensor | None = None,
+) -> Rendering:
+    """Render rays ``(N, 3)``; with a generator, samples are jittered within their intervals.
+
+    ``occupied``: nodes of :meth:`RadianceField.occupied_nodes`; samples nearest to other nodes are taken as empty.
+    """
+    edges = sampling.edges().expand(len(origins), -1)
+    fraction = torch.rand(len(origins), edges.shape[1] - 1, generator=generator) if generator else torch.tensor(0.5)
+    lengths = edges[:, 1:] - edges[:, :-1]
+    middles = edges[:, :-1] + fraction * lengths
+    positions = origins[:, None] + middles[..., None] * directions[:, None]
+    if occupied is None:
+        density = field.density_fn(positions)[..., 0]
+    else:
+        flat = positions.view(-1, 3)
+        inhabited = occupied[field.nearest_nodes(flat)].nonzero()[:, 0]
+        values = field.density_fn(flat[inhabited])[:, 0]
+        density = torch.zeros(len(flat)).index_put((inhabited,), values).view(positions.shape[:2])
+    depth = density * lengths
+    transmittance = torch.exp(-torch.cumsum(depth, dim=1) + depth)
+    weights = transmittance * -torch.expm1(-depth)
+    chosen = weights.detach() > sampling.minimal_weight
+    ray = chosen.nonzero()[:, 0]
+    color = field.color(positions[chosen], directions[ray])
+    rgb = torch.zeros_like(origins).index_add(0, ray, color * weights[chosen][:, None])
+    return Rendering(rgb, weights, edges, positions, density)
+
+
+def median_distance(rendering: Rendering) -> Tensor:
+    """``(N,)`` distance along the ray at which transmittance falls below one half; inf where it never does."""
+    accumulated = torch.cumsum(rendering.weights, dim=1)
+    reached = accumulated >= 0.5
+    index = reached.to(torch.int8).argmax(dim=1, keepdim=True)
+    before = torch.gather(accumulated - rendering.weights, 1, index)
+    weight = torch.gather(rendering.weights, 1, index).clamp_min(1e-12)
+    low = torch.gather(rendering.edges, 1, index)
+    high = torch.gather(rendering.edges, 1, index + 1)
+    distance = low + (high - low) * ((0.5 - before) / weight).clamp(0.0, 1.0)
+    return torch.where(reached.any(dim=1), distance[:, 0], torch.tensor(float("inf")))
+
+
+@torch.no_grad()
+def render_view(
+    field: RadianceField,
+    cameras: Cameras,
+    index: int,
+    *,
+    sampling: Sampling | None = None,
+    chunk: int = 4096,
+    background: float = 0.5,
+) -> dict[str, NDArray[np.float32]]:
+    """Render one camera.
+
+    Returns:
+        ``rgb (H, W, 3)`` in [0, 1]; ``depth (H, W)``: distance along the unit ray at which the
+        transmittance falls below one half, inf where it never does; ``accumulation (H, W)``.
+    """
+    sampling = sampling or Sampling()
+    origins, directions = cameras.rays(index)
+    rays = (torch.from_numpy(item.reshape(-1, 3)).float() for item in (origins, directions))
+    parts = []
+    for start, toward in zip(*(item.split(chunk) for item in rays)):
+        rendering = render_rays(field, start, toward, sampling)
+        rgb = rendering.rgb + (1.0 - rendering.accumulation[:, None]) * background
+        parts.append((rgb, median_distance(rendering), rendering.accumulation))
+    shape = (cameras.height, cameras.width)
+    rgb, depth, accumulation = (torch.cat(column).numpy() for column in zip(*parts))
+    return {"rgb": rgb.reshape(*shape, 3), "depth": depth.reshape(shape), "accumulation": accumulation.reshape(shape)}

@@ -1,0 +1,182 @@
+"""Fit a :class:`RadianceField` to photos."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from dataclasses import field as _field
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..core.cameras import Cameras
+from .radiance import RadianceField
+from .rendering import Rendering, Sampling, render_rays
+
+Regularizer = Callable[[RadianceField, int], "Tensor | None"]
+Observer = Callable[[Tensor, Tensor], None]
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """How to fit.
+
+    Attributes:
+        rays: rays a step (the paper: 4096).
+        learning_rate, final_learning_rate: Adam's, decayed exponentially over the run.
+        distortion_weight: of the mip-NeRF 360 distortion loss (nerfacto has it on by default).
+        stages: (share of the run at which it begins, share of the final resolution), coarse to fine.
+        sampling: where rays are sampled.
+        skip_from, skip_below: from this share of the run on, space below this opacity a cell is skipped
+            (looked at anew every 16 steps).
+    """
+
+    rays: int = 4096
+    learning_rate: float = 0.1
+    final_learning_rate: float = 0.01
+    distortion_weight: float = 0.002
+    stages: tuple[tuple[float, float], ...] = ((0.0, 0.4), (0.12, 0.65), (0.3, 1.0))
+    sampling: Sampling = _field(default_factory=Sampling)
+    skip_from: float = 0.15
+    skip_below: float = 1e-3
+
+
+def distortion_loss(rendering: Rendering) -> Tensor:
+    """mip-NeRF 360, eq. 15, per ray ``(N,)``, on distances squashed to [0, 1) by ``t / (1 + t)``; O(samples)."""
+    squashed = rendering.edges / (1.0 + rendering.edges)
+    width = squashed[:, 1:] - squashed[:, :-1]
+    middle = squashed[:, :-1] + width / 2
+    weights = rendering.weights
+    before = torch.cumsum(weights, dim=1) - weights
+    moment = torch.cumsum(weights * middle, dim=1) - weights * middle
+    return (2.0 * weights * (middle * before - moment)).sum(1) + (weights**2 * width).sum(1) / 3.0
+
+
+def gather_rays(cameras: Cameras, images: NDArray[np.float32]) -> tuple[Tensor, Tensor, Tensor]:
+    """All pixels of all photos: origins, unit directions, colours, each ``(pixels, 3)`` float32.
+
+    Raises:
+        ValueError: ``images`` is not ``(N, height, width, 3)`` for the N cameras.
+    """
+    expected = (len(cameras), cameras.height, cameras.width, 3)
+    if images.shape != expected:
+        raise ValueError(f"gather_rays: images must have shape {expected}, got {images.shape}")
+    rays = [cameras.rays(index) for index in range(len(cameras))]
+    origins, directions = (np.concatenate([ray[part].reshape(-1, 3) for ray in rays]) for part in (0, 1))
+    tensors = (torch.from_numpy(np.ascontiguousarray(item, dtype=np.float32)) for item in (origins, directions))
+    return (*tensors, torch.from_numpy(np.ascontiguousarray(images.reshape(-1, 3))))
+
+
+class _Progress:
+    """Share of the run that is done, by steps or by seconds."""
+
+    def __init__(self, steps: int | None, seconds: float | None) -> None:
+        if steps is None and seconds is None:
+            raise ValueError("train_field: give steps or seconds (or both)")
+        self.steps, self.seconds, self.start = steps, seconds, time.perf_counter()
+
+    def __call__(self, step: int) -> float:
+        by_step = step / self.steps if self.steps else 0.0
+        by_time = (time.perf_counter() - self.start) / self.seconds if self.seconds else 0.0
+        return max(by_step, by_time)
+
+
+def _optimizer(field: RadianceField, rate: float) -> torch.optim.Adam:
+    return torch.optim.Adam(field.parameters(), lr=rate, betas=(0.9, 0.99), eps=1e-12, fused=True)
+
+
+def _set_stage(field: RadianceField, stages: tuple[tuple[float, float], ...], done: float) -> bool:
+    """Resample the field if a stage has begun; True if it did."""
+    share = max((stage for stage in stages if stage[0] <= done), key=lambda stage: stage[0])[1]
+    density, color = (max(8, round(size * share)) for size in (field.config.resolution, field.config.color_resolution))
+    if (field.resolution, field.color_resolution) == (density, color):
+        return False
+    field.resample(density, color)
+    return True
+
+
+def train_field(
+    field: RadianceField,
+    cameras: Cameras,
+    images: NDArray[np.float32],
+    *,
+    steps: int | None = None,
+    seconds: float | None = None,
+    seed: int = 0,
+    config: TrainingConfig | None = None,
+    fine_tune: bool = False,
+    regularizer: Regularizer | None = None,
+    observer: Observer | None = None,
+    progress: bool = False,
+) -> dict[str, Any]:
+    """Fit ``field`` in place to ``images (N, H, W, 3)`` in [0, 1].
+
+    Args:
+        steps, seconds: where to stop (whichever comes first); the learning rate decays towards it.
+        seed: of the rays, their jitter and the backgrounds.
+        fine_tune: keep the resolution and the final learning rate throughout.
+        regularizer: called as ``regularizer(field, step)``; what it returns is added to the loss.
+        observer: called with the positions ``(M, 3)`` and densities ``(M,)`` of the rendered samples.
+        progress: draw a progress bar.
+
+    Returns:
+        ``steps``, ``seconds``, ``psnr`` (of the last hundred batches).
+
+    Raises:
+        FloatingPointError: the loss is not finite.
+    """
+    config = config or TrainingConfig()
+    generator = torch.Generator().manual_seed(seed)
+    origins, directions, colors = gather_rays(cameras, images)
+    done = _Progress(steps, seconds)
+    stages = ((0.0, 1.0),) if fine_tune else config.stages
+    _set_stage(field, stages, 0.0)
+    optimizer = _optimizer(field, config.learning_rate)
+    errors: list[float] = []
+    bar = _bar(progress, steps)
+    step = 0
+    while (share := done(step)) < 1.0:
+        if resampled := _set_stage(field, stages, share):
+            optimizer = _optimizer(field, config.learning_rate)
+        decay = 1.0 if fine_tune else share
+        rate = config.learning_rate * (config.final_learning_rate / config.learning_rate) ** decay
+        for group in optimizer.param_groups:
+            group["lr"] = rate
+        batch = torch.randint(len(origins), (config.rays,), generator=generator)
+        if step % 16 == 0 or resampled:
+            skipping = fine_tune or share >= config.skip_from
+            occupied = field.occupied_nodes(config.skip_below) if skipping else None
+        rendering = render_rays(
+            field, origins[batch], directions[batch], config.sampling, generator=generator, occupied=occupied
+        )
+        background = torch.rand(config.rays, 3, generator=generator)
+        rgb = rendering.rgb + (1.0 - rendering.accumulation[:, None]) * background
+        photometric = torch.nn.functional.mse_loss(rgb, colors[batch])
+        loss = photometric + config.distortion_weight * distortion_loss(rendering).mean()
+        if observer is not None:
+            observer(rendering.positions.reshape(-1, 3), rendering.density.detach().reshape(-1))
+        if regularizer is not None and (extra := regularizer(field, step)) is not None:
+            loss = loss + extra
+        errors.append(float(photometric.detach()))
+        if not np.isfinite(errors[-1]):
+            raise FloatingPointError(f"train_field: the loss is not finite at step {step}")
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        optimizer.step()
+        step += 1
+        bar.update(1)
+        if step % 20 == 0:
+            bar.set_postfix_str(f"{-10 * np.log10(np.mean(errors[-100:])):.2f} dB")
+    bar.close()
+    psnr = float(-10 * np.log10(np.mean(errors[-100:]))) if errors else float("nan")
+    return {"steps": step, "seconds": time.perf_counter() - done.start, "psnr": psnr}
+
+
+def _bar(enabled: bool, total: int | None) -> Any:
+    from tqdm import tqdm
+
+    return tqdm(total=total, disable=not enabled, unit="step", desc="fit")

@@ -1,0 +1,89 @@
+"""Trilinear lookup in a dense grid, fast on a CPU.
+
+A lookup is a sparse matrix (8 weights a row) times the table. On a CPU the product runs as a
+compressed-row product in torch and its transpose in scipy: measured 5-8 times faster than
+``grid_sample`` or ``embedding_bag`` with their backward passes.
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+def _corners(coordinates: Tensor, resolution: int) -> tuple[Tensor, Tensor]:
+    """Flat indices ``(N, 8)`` int32 and weights ``(N, 8)`` of the nodes around ``coordinates (N, 3)``."""
+    low = coordinates.floor().clamp_(0, resolution - 2)
+    high_weight = coordinates - low
+    low_weight = 1.0 - high_weight
+    cell = low.to(torch.int32)
+    base = (cell[:, 0] * resolution + cell[:, 1]) * resolution + cell[:, 2]
+    plane = resolution * resolution
+    offsets = [x * plane + y * resolution + z for x in (0, 1) for y in (0, 1) for z in (0, 1)]
+    index = base[:, None] + torch.tensor(offsets, dtype=torch.int32, device=base.device)
+    pair = torch.stack([low_weight, high_weight], dim=-1)  # (N, 3, 2)
+    weights = pair[:, 0, :, None, None] * pair[:, 1, None, :, None] * pair[:, 2, None, None, :]
+    return index, weights.reshape(-1, 8)
+
+
+def _scatter(index: Tensor, weights: Tensor, grad: Tensor, nodes: int) -> Tensor:
+    """Transpose product: ``sum_n weights[n, k] * grad[n]`` into ``nodes`` rows."""
+    if index.device.type == "cpu":
+        try:
+            from scipy.sparse import csr_matrix
+        except ImportError:
+            pass
+        else:
+            starts = torch.arange(0, index.numel() + 1, 8, dtype=torch.int32).numpy()
+            matrix: Any = csr_matrix(
+                (weights.reshape(-1).numpy(), index.reshape(-1).numpy(), starts), shape=(len(index), nodes)
+            )
+            return torch.from_numpy(matrix.T @ grad.contiguous().numpy())
+    spread = (grad[:, None, :] * weights[:, :, None]).reshape(-1, grad.shape[1])
+    return torch.zeros(nodes, grad.shape[1], device=grad.device).index_add_(0, index.reshape(-1), spread)
+
+
+class _Lookup(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, table: Tensor, index: Tensor, weights: Tensor) -> Tensor:  # type: ignore[override]
+        ctx.save_for_backward(index, weights)
+        ctx.nodes = len(table)
+        if not len(index):
+            return table.new_zeros(0, table.shape[1])
+        starts = torch.arange(0, index.numel() + 1, 8, dtype=torch.int32, device=index.device)
+        with warnings.catch_warnings():  # torch calls its CSR format "beta" once per process
+            warnings.filterwarnings("ignore", message="Sparse CSR tensor support")
+            matrix = torch.sparse_csr_tensor(
+                starts, index.reshape(-1), weights.reshape(-1), (len(index), len(table)), check_invariants=False
+            )
+            return matrix @ table
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[override]
+        index, weights = ctx.saved_tensors
+        if not len(index):
+            return grad.new_zeros(ctx.nodes, grad.shape[1]), None, None
+        return _scatter(index, weights, grad, ctx.nodes), None, None
+
+
+def trilinear(table: Tensor, coordinates: Tensor, resolution: int) -> Tensor:
+    """Interpolate a node-centred grid.
+
+    Args:
+        table: ``(resolution^3, C)`` float32, node ``[i, j, k]`` at row ``(i * resolution + j) * resolution + k``.
+        coordinates: ``(N, 3)`` in node units, [0, resolution - 1]; outside, the edge cell extrapolates.
+            No gradient flows to them.
+
+    Returns:
+        ``(N, C)``, differentiable with respect to the table.
+    """
+    if table.shape[0] != resolution**3:
+        raise ValueError(
+            f"trilinear: table must have {resolution**3} rows for resolution {resolution}, got {len(table)}"
+        )
+    index, weights = _corners(coordinates.detach(), resolution)
+    result: Tensor = _Lookup.apply(table, index, weights)  # type: ignore[no-untyped-call]
+    return result
