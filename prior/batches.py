@@ -29,6 +29,9 @@ def apply_symmetry(grid: NDArray[Any], symmetry: int) -> NDArray[Any]:
     return np.flip(grid.transpose(permutation), flips)
 
 
+BLIND_SEVERITY = 0.8
+
+
 @dataclass(frozen=True)
 class Batch:
     """``channels (N, 1, R, R, R)``, ``labels (N, R, R, R)``, ``timestep (N,)`` and ``edge_fraction (N,)``."""
@@ -43,8 +46,8 @@ class Mixture:
     """Random access to an endless weighted mixture of shards.
 
     Sample i draws, from a generator seeded by (seed, i): its shard (by weight), its cube, one of the 48
-    symmetries, and ``t = round(999 u)``, ``u`` uniform in [severity, 1]: the timestep says "at most this
-    much corruption", so a clean cube is seen at every timestep.
+    symmetries, and ``t = round(999 u)``, ``u`` uniform in [min(severity, BLIND_SEVERITY), 1]: the timestep says
+    "at most this much corruption", from ``BLIND_SEVERITY`` on "any amount"; a clean cube is seen at every timestep.
     """
 
     def __init__(self, shards: Sequence[tuple[str | Path, float]], *, seed: int) -> None:
@@ -75,11 +78,12 @@ class Mixture:
             for shard, cube, symmetry, _ in draws
         ]
         severity = np.array([shard.severity[cube] for shard, cube, _, _ in draws], dtype=np.float64)
+        least = np.minimum(severity, BLIND_SEVERITY)
         position = np.array([position for *_, position in draws])
         return Batch(
             dequantize_signed(np.stack(stored))[:, None],
             np.stack(labels),
-            timestep_from_severity(severity + (1.0 - severity) * position),
+            timestep_from_severity(least + (1.0 - least) * position),
             np.array([shard.edge_fraction[cube] for shard, cube, _, _ in draws], dtype=np.float32),
         )
 
