@@ -137,30 +137,43 @@ def compose_object(rng: np.random.Generator, recipe: Recipe) -> ComposedObject:
     return ComposedObject(tuple(parts), float((high - low).max()))
 
 
+def _newton(part: Part, points: Array, steps: int = 6) -> tuple[Array, Array]:
+    """Points ``(N, 3)`` moved onto a part's own surface, and the distance's gradient there (finite differences)."""
+    width = 1e-3 * part.extent
+    stencil = np.concatenate([np.zeros((1, 3)), np.eye(3) * width])[:, None, :]
+    normals = np.zeros_like(points)
+    for _ in range(steps):
+        values = part.distance((points[None] + stencil).reshape(-1, 3)).reshape(4, -1)
+        normals = ((values[1:] - values[0]) / width).T
+        moves = normals * (values[0] / np.maximum((normals**2).sum(axis=1), 1e-2))[:, None]
+        lengths = np.linalg.norm(moves, axis=1, keepdims=True)
+        points = points - moves * np.minimum(1.0, 0.5 * part.extent / np.maximum(lengths, 1e-12))
+    return points, normals
+
+
 def surface_point(rng: np.random.Generator, composed: ComposedObject, *, tries: int = 24) -> tuple[Array, Array]:
     """A point on the surface and the unit normal there, both ``(3,)``.
 
-    A part is drawn, points about it are moved onto its surface by six Newton steps on its own distance,
-    and one of those that lie on the whole object's surface is taken (the nearest, if none does).
-    Parts are equally likely whatever their extent, which favours detail.
+    A part is drawn, points about it are moved onto its surface by Newton steps on its own distance, and one
+    of those that lie on the whole object's surface is taken. A part without any (buried, or a cavity beside
+    the solids) is replaced by another one, up to four times; then the nearest miss is taken. Parts are
+    equally likely whatever their extent, which favours detail.
     """
-    part = composed.parts[int(rng.integers(len(composed.parts)))]
-    points = part.center + rng.uniform(-0.55, 0.55, size=(tries, 3)) * part.extent
-    step = 1e-3 * part.extent
-    stencil = np.concatenate([np.zeros((1, 3)), np.eye(3) * step])[:, None, :]
-    normals = np.zeros_like(points)
-    for _ in range(6):
-        values = part.distance((points[None] + stencil).reshape(-1, 3)).reshape(4, -1)
-        normals = ((values[1:] - values[0]) / step).T
-        steepness = np.maximum((normals**2).sum(axis=1), 1e-2)
-        moves = normals * (values[0] / steepness)[:, None]
-        lengths = np.linalg.norm(moves, axis=1, keepdims=True)
-        points = points - moves * np.minimum(1.0, 0.5 * part.extent / np.maximum(lengths, 1e-12))
-    misses = np.abs(composed.distance(points))
-    hits = np.flatnonzero(misses < 2e-3 * part.extent)
-    chosen = int(hits[int(rng.integers(len(hits)))]) if len(hits) else int(np.argmin(misses))
-    normal = normals[chosen]
-    return points[chosen], normal / max(float(np.linalg.norm(normal)), 1e-12)
+    best: tuple[float, Array, Array] | None = None
+    for row in rng.permutation(len(composed.parts))[:4]:
+        part = composed.parts[int(row)]
+        start = part.center + rng.uniform(-0.55, 0.55, size=(tries, 3)) * part.extent
+        points, normals = _newton(part, start)
+        misses = np.abs(composed.distance(points))
+        hits = np.flatnonzero(misses < 1e-3 * part.extent)
+        chosen = int(hits[int(rng.integers(len(hits)))]) if len(hits) else int(np.argmin(misses))
+        if best is None or misses[chosen] < best[0]:
+            best = float(misses[chosen]), points[chosen], normals[chosen]
+        if len(hits):
+            break
+    assert best is not None  # an object has at least one part
+    normal = best[2] if np.any(best[2]) else rng.normal(size=3)
+    return best[1], normal / np.linalg.norm(normal)
 
 
 def dilate(occupancy: Occupancy, iterations: int, *, faces_only: bool = False) -> Occupancy:

@@ -53,6 +53,7 @@ class Recipe:
         severity: range of the severity of all others, within [0, 1].
         severity_exponent: severity is ``low + (high - low) * u ** exponent``.
         licences: mesh licences that may be used.
+        formats: mesh file endings, those that need no further reader (``dae`` needs pycollada).
         split: the split of the mesh manifest.
         cubes_per_mesh: consecutive samples that share a mesh (so that a worker loads few).
     """
@@ -80,6 +81,7 @@ class Recipe:
     severity: tuple[float, float] = (0.02, 1.0)
     severity_exponent: float = 1.0
     licences: tuple[str, ...] = ("CC0-1.0", "MIT-0")
+    formats: tuple[str, ...] = ("glb", "gltf", "obj", "ply", "stl")
     split: str = "train"
     cubes_per_mesh: int = 64
 

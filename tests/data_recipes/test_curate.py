@@ -1,0 +1,121 @@
+import dataclasses
+import shutil
+
+import numpy as np
+import pytest
+
+from unghost.core.occupancy import FREE_LABEL, SURFACE_LABEL
+from unghost.core.shards import ARRAYS, dequantize_signed, read_shard, unpack_labels
+from unghost.data_recipes import curate as module
+from unghost.data_recipes.curate import curate, sample_pair
+from unghost.data_recipes.recipe import Recipe, load_recipe
+
+RECIPE = Recipe(parts=(1, 3))
+
+
+def arrays(folder):
+    shard = read_shard(folder, verify=True)
+    return {name: np.array(getattr(shard, name)) for name in ARRAYS}
+
+
+def test_same_bytes_for_one_and_two_workers(tmp_path):
+    one = curate(RECIPE, tmp_path / "one", count=40, seed=3)
+    two = curate(RECIPE, tmp_path / "two", count=40, seed=3, workers=2)
+    for file in ("manifest.json", *(f"{name}.npy" for name in ARRAYS)):
+        assert (one[0] / file).read_bytes() == (two[0] / file).read_bytes()
+
+
+def test_shard_rows_are_the_single_samples(tmp_path):
+    shard = read_shard(curate(RECIPE, tmp_path, count=12, seed=9)[0], verify=True)
+    labels = unpack_labels(np.array(shard.labels))
+    for index in (0, 5, 11):
+        signed, clean, severity, fraction, group = sample_pair(RECIPE, index, seed=9)
+        np.testing.assert_allclose(dequantize_signed(shard.inputs[index]), signed, atol=1 / 255 + 1e-6)
+        np.testing.assert_array_equal(labels[index], np.where(clean, SURFACE_LABEL, FREE_LABEL))
+        assert (shard.severity[index], shard.edge_fraction[index]) == (np.float32(severity), np.float32(fraction))
+        assert shard.group[index] == group == index
+
+
+def test_seeds_and_samples_differ():
+    first = sample_pair(RECIPE, 0, seed=0)[0]
+    assert not np.array_equal(first, sample_pair(RECIPE, 1, seed=0)[0])
+    assert not np.array_equal(first, sample_pair(RECIPE, 0, seed=1)[0])
+
+
+def test_shares_of_clean_and_soft_inputs():
+    pairs = [sample_pair(RECIPE, index, seed=1) for index in range(150)]
+    untouched = [signed for signed, _, severity, _, _ in pairs if severity == 0]
+    soft = [np.abs(signed).min() < 1 for signed, _, severity, _, _ in pairs if severity > 0]
+    assert 0.03 < len(untouched) / 150 < 0.2
+    assert 0.35 < np.mean(soft) < 0.65
+    for signed, clean, severity, _, _ in pairs:
+        if severity == 0:
+            np.testing.assert_array_equal(signed, np.where(clean, 1.0, -1.0))
+    assert any(not clean.any() for _, clean, _, _, _ in pairs)  # truly empty: all free
+
+
+def test_empty_field_encodes_to_minus_one():
+    signed, clean, _, _, _ = sample_pair(dataclasses.replace(RECIPE, empty_share=1.0, clean_share=1.0), 0, seed=0)
+    assert not clean.any()
+    assert (signed == -1).all()
+
+
+def test_finished_shards_are_skipped_and_missing_ones_made(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "SHARD_LENGTH", 8)
+    folders = curate(RECIPE, tmp_path, count=20, seed=0)
+    assert [folder.name for folder in folders] == ["shard-00000", "shard-00001", "shard-00002"]
+    assert [len(read_shard(folder)) for folder in folders] == [8, 8, 4]
+    before = [arrays(folder) for folder in folders]
+    stamps = [(folder / "manifest.json").stat().st_mtime_ns for folder in folders]
+    shutil.rmtree(folders[1])
+    assert curate(RECIPE, tmp_path, count=20, seed=0) == folders
+    for folder, wanted in zip(folders, before):
+        for name, array in arrays(folder).items():
+            np.testing.assert_array_equal(array, wanted[name])
+    after = [(folder / "manifest.json").stat().st_mtime_ns for folder in folders]
+    assert [a == b for a, b in zip(stamps, after)] == [True, False, True]
+
+
+def test_another_curation_in_the_same_folder_is_refused(tmp_path):
+    curate(RECIPE, tmp_path, count=4, seed=0)
+    with pytest.raises(ValueError, match=r"holds another curation \(it differs in seed\)"):
+        curate(RECIPE, tmp_path, count=4, seed=1)
+    with pytest.raises(ValueError, match=r"differs in recipe"):
+        curate(dataclasses.replace(RECIPE, soft_share=0.1), tmp_path, count=4, seed=0)
+
+
+@pytest.mark.parametrize(("name", "value"), [("count", 0), ("seed", -1), ("workers", 0), ("count", 2**31)])
+def test_bad_numbers_are_named(tmp_path, name, value):
+    with pytest.raises(ValueError, match=f"curate: {name} must be"):
+        curate(RECIPE, tmp_path / "out", **{"count": 1, "seed": 0, "workers": 1, name: value})
+    assert not (tmp_path / "out").exists()
+
+
+def test_mesh_recipes_need_a_folder(tmp_path):
+    with pytest.raises(ValueError, match="mesh_root must name their folder, got None"):
+        curate(load_recipe("meshes"), tmp_path, count=1, seed=0)
+    with pytest.raises(FileNotFoundError, match=r"manifest.csv is not a file"):
+        curate(load_recipe("meshes"), tmp_path / "out", count=1, seed=0, mesh_root=tmp_path)
+
+
+def test_mesh_pairs_carry_their_mesh_as_group(tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    lines = ["path,split,licence"]
+    for number in range(3):
+        trimesh.creation.icosphere(subdivisions=1, radius=1 + number).export(tmp_path / f"{number}.ply")
+        lines.append(f"{number}.ply,{'val' if number == 1 else 'train'},CC0-1.0")
+    (tmp_path / "manifest.csv").write_text("\n".join(lines), encoding="utf-8")
+    recipe = dataclasses.replace(load_recipe("meshes"), cubes_per_mesh=4)
+    shard = read_shard(curate(recipe, tmp_path / "out", count=16, seed=0, mesh_root=tmp_path)[0])
+    assert set(shard.group.tolist()) == {0, 2}
+    assert shard.provenance["recipe"]["licences"] == ["CC0-1.0", "MIT-0"]
+    assert str(tmp_path) not in str(shard.provenance)  # a shard names no folder of the machine
+
+
+def test_progress_goes_to_stderr_and_silence_is_the_default(tmp_path, capsys):
+    curate(RECIPE, tmp_path / "quiet", count=2, seed=0)
+    assert capsys.readouterr() == ("", "")
+    curate(RECIPE, tmp_path / "loud", count=2, seed=0, progress=True)
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert "cube" in shown.err
