@@ -88,11 +88,11 @@ def _spread(rng: np.random.Generator, mask: NDArray[np.bool_], width: float, pea
 
 
 def _fog(rng: np.random.Generator, severity: float, resolution: int) -> Grid:
-    """Low-frequency fog: patches whose opacity per voxel reaches 0.03 to 0.9 (log-uniform), times severity."""
+    """Low-frequency fog: patches whose opacity per voxel reaches 0.08 to 0.95 (log-uniform), times severity."""
     noise = coarse_noise(rng, int(rng.integers(2, 7)), resolution)
     noise += np.float32(0.3) * coarse_noise(rng, int(rng.integers(5, 12)), resolution)
     patches = np.maximum(noise - np.float32(rng.uniform(-1.5, 1.0)), 0.0)
-    strongest = _optical_depth(float(np.exp(rng.uniform(np.log(0.03), np.log(0.9)))) * severity)
+    strongest = _optical_depth(float(np.exp(rng.uniform(np.log(0.08), np.log(0.95)))) * severity)
     fog: Grid = patches * np.float32(strongest / max(float(patches.max()), 1e-6))
     return fog
 
@@ -136,7 +136,7 @@ def soften(
         ghosts = _spread(rng, ghost, fade * rng.uniform(0.3, 2.5), peak)
         uneven = np.exp(np.float32(rng.uniform(0, 1.0)) * coarse_noise(rng, int(rng.integers(2, 8)), resolution))
         depth = depth + ghosts * uneven
-    if rng.random() < 0.7:
+    if rng.random() < 0.75:
         depth = depth + _fog(rng, severity, resolution)
     strength = np.float32(fade * rng.uniform(0.0, 0.5))
     depth = depth * np.exp(strength * coarse_noise(rng, int(rng.integers(3, 20)), resolution))
