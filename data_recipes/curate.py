@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from ..core.frames import RESOLUTION
-from ..core.occupancy import FREE_LABEL, SURFACE_LABEL, signed_from_occupancy
+from ..core.occupancy import FREE_LABEL, IGNORE_LABEL, SURFACE_LABEL, signed_from_occupancy
 from ..core.shards import pack_labels, quantize_signed, read_shard, write_shard
 from .augment import corrupt, soften
 from .compose import dilate, sample_cube
@@ -22,6 +22,7 @@ from .recipe import Recipe
 
 SHARD_LENGTH = 8192
 CHUNK_LENGTH = 256
+SOFT_SKIRT = 1  # voxels
 MAX_COUNT = 2**31 - 1  # a group is an int32
 
 Arrays = dict[str, NDArray[Any]]
@@ -40,28 +41,54 @@ def _clean_cube(rng: np.random.Generator, recipe: Recipe, mesh_root: str | None,
     return drawn
 
 
+def damage(
+    rng: np.random.Generator, clean: NDArray[np.bool_], recipe: Recipe
+) -> tuple[NDArray[np.float32], NDArray[np.uint8], float]:
+    """Corrupt one clean cube as a recipe says.
+
+    A soft input spreads true surfaces over their neighbours, which is no fault: there, voxels next to the
+    surface carry the label "ignore".
+
+    Args:
+        rng: of this sample.
+        clean: ``(R, R, R)`` bool.
+        recipe: its ``clean_share``, ``severity``, ``soft_share`` and ``soft_dilation`` count.
+
+    Returns:
+        input ``(R, R, R)`` float32 signed opacity, labels ``(R, R, R)`` uint8 (0 free, 1 surface, 2 ignore),
+        severity in [0, 1].
+    """
+    if rng.random() < recipe.clean_share:
+        return signed_from_occupancy(clean), _labels(clean), 0.0
+    low, high = recipe.severity
+    severity = float(low + (high - low) * rng.random() ** recipe.severity_exponent)
+    if rng.random() >= recipe.soft_share:
+        return signed_from_occupancy(corrupt(rng, clean, severity)), _labels(clean), severity
+    clean = dilate(clean, recipe.soft_dilation)
+    signed = soften(rng, clean, corrupt(rng, clean, severity), severity)
+    labels = _labels(clean)
+    labels[dilate(clean, SOFT_SKIRT) & ~clean] = IGNORE_LABEL
+    return signed, labels, severity
+
+
+def _labels(clean: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    return np.where(clean, SURFACE_LABEL, FREE_LABEL).astype(np.uint8)
+
+
 def sample_pair(
     recipe: Recipe, index: int, *, seed: int, mesh_root: str | Path | None = None
-) -> tuple[NDArray[np.float32], NDArray[np.bool_], float, float, int]:
+) -> tuple[NDArray[np.float32], NDArray[np.uint8], float, float, int]:
     """Training pair ``index``: depends on (recipe, seed, index) alone.
 
     Returns:
-        input ``(32, 32, 32)`` float32 signed opacity, clean occupancy ``(32, 32, 32)`` bool, severity in
-        [0, 1], edge fraction, group (the sample's own index, or its mesh's row in the manifest).
+        input ``(32, 32, 32)`` float32 signed opacity, labels ``(32, 32, 32)`` uint8 (see :func:`damage`), severity
+        in [0, 1], edge fraction, group (the sample's own index, or its mesh's row in the manifest).
     """
     root = _checked_root(recipe, mesh_root)
     rng = np.random.default_rng([seed, index])
     clean, fraction, group = _clean_cube(rng, recipe, root, index, seed)
-    if rng.random() < recipe.clean_share:
-        return signed_from_occupancy(clean), clean, 0.0, fraction, group
-    low, high = recipe.severity
-    severity = float(low + (high - low) * rng.random() ** recipe.severity_exponent)
-    if rng.random() < recipe.soft_share:
-        clean = dilate(clean, recipe.soft_dilation)
-        signed = soften(rng, clean, corrupt(rng, clean, severity), severity)
-    else:
-        signed = signed_from_occupancy(corrupt(rng, clean, severity))
-    return signed, clean, severity, fraction, group
+    signed, labels, severity = damage(rng, clean, recipe)
+    return signed, labels, severity, fraction, group
 
 
 def _checked_root(recipe: Recipe, mesh_root: str | Path | None) -> str | None:
@@ -83,9 +110,8 @@ def _chunk(recipe: Recipe, seed: int, mesh_root: str | None, start: int, stop: i
         "group": np.empty(count, dtype=np.int32),
     }
     for row, index in enumerate(range(start, stop)):
-        signed, clean, severity, fraction, group = sample_pair(recipe, index, seed=seed, mesh_root=mesh_root)
+        signed, labels, severity, fraction, group = sample_pair(recipe, index, seed=seed, mesh_root=mesh_root)
         arrays["inputs"][row] = quantize_signed(signed)
-        labels = np.where(clean, SURFACE_LABEL, FREE_LABEL).astype(np.uint8)
         arrays["labels"][row] = pack_labels(labels[None])[0]
         arrays["severity"][row], arrays["edge_fraction"][row] = severity, fraction
         arrays["group"][row] = group

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.aabb import contains, scene_extent
-from ..core.frames import RESOLUTION, cube_lattices, random_rotations
+from ..core.frames import RESOLUTION, CubeFrame, cube_lattices, random_rotations
 from ..core.occupancy import (
     DEFAULT_OPACITY_THRESHOLD,
     EMPTY,
@@ -40,9 +40,10 @@ from ..core.shards import pack_labels, quantize_signed, read_shard, write_shard
 if TYPE_CHECKING:
     from ..fields.radiance import RadianceField
     from ..fields.scenes import PhotographedScene
-    from ..fields.solids import SolidScene
 
 SURFACE_BAND, FREE_BAND = 0.75, 1.5  # in field cells
+EARLY = 0.45  # share of the fit at which the first cubes are taken
+EARLY_STEPS = 60  # at the least, before the first snapshot
 
 
 @dataclass(frozen=True)
@@ -52,54 +53,71 @@ class HarvestConfig:
     Attributes:
         resolutions: density nodes along an axis of the contracted cube.
         photos, photo_width: how many photos a field sees, and their width in pixels (4:3).
-        steps: fitting steps, log-uniform; cubes are also taken after a quarter of them.
+        steps: fitting steps, log-uniform; cubes are also taken after ``EARLY`` of them.
         rays: rays a step.
         cubes: cubes per snapshot (two snapshots a scene).
         voxel_pitch: voxel side in field cells, log-uniform.
         rotated_share: share of cubes with a random rotation.
+        room_pitch: voxel side of :func:`room_scene`'s cubes, scene units, log-uniform.
     """
 
     resolutions: tuple[int, ...] = (64, 80, 96, 112, 128, 160)
     photos: tuple[int, int] = (10, 30)
     photo_width: tuple[int, int] = (72, 120)
-    steps: tuple[int, int] = (250, 1000)
-    rays: int = 1536
-    cubes: int = 140
+    steps: tuple[int, int] = (250, 900)
+    rays: int = 1152
+    cubes: int = 224
     voxel_pitch: tuple[float, float] = (0.5, 1.25)
     rotated_share: float = 0.5
+    room_pitch: tuple[float, float] = (0.008, 0.05)
+
+    def __post_init__(self) -> None:
+        for name in ("photos", "photo_width", "steps", "voxel_pitch", "room_pitch"):
+            low, high = getattr(self, name)
+            if not 0 < low <= high:
+                raise ValueError(f"HarvestConfig: {name} must be (low, high) with 0 < low <= high, got {(low, high)}")
+        if self.steps[0] <= EARLY_STEPS:
+            raise ValueError(f"HarvestConfig: steps must be > {EARLY_STEPS}, got {self.steps}")
+        if min(self.rays, self.cubes) < 1:
+            raise ValueError(f"HarvestConfig: rays and cubes must be >= 1, got {self.rays} and {self.cubes}")
 
 
-def _distances(scene: SolidScene, points: NDArray[np.float64], margin: float, aabb: NDArray[np.float64]) -> Any:
-    """Signed distance of ``points (N, 3)``, exact where it is at most ``margin``, else a value beyond the margin.
+class Truth:
+    """The labels of a photographed scene; a coarse grid of exact distances settles most points.
 
-    A coarse grid of exact distances settles most points: a signed distance changes by no more than one goes.
+    A signed distance changes by no more than one goes, so that a node far from any surface speaks for its cell.
     """
-    nodes = 96
-    axes = [np.linspace(aabb[0, axis], aabb[1, axis], nodes) for axis in range(3)]
-    coarse = scene.signed_distance(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1))
-    cell = (aabb[1] - aabb[0]) / (nodes - 1)
-    index = np.clip(np.rint((points - aabb[0]) / cell), 0, nodes - 1).astype(np.int64)
-    distance = coarse[index[:, 0], index[:, 1], index[:, 2]]
-    slack = np.linalg.norm(points - (aabb[0] + index * cell), axis=1)
-    close = np.flatnonzero(np.abs(distance) - slack <= margin)
-    distance[close] = scene.signed_distance(points[close])
-    return distance
 
+    def __init__(self, photographed: PhotographedScene, aabb: NDArray[np.float64], *, nodes: int = 64) -> None:
+        self.photographed, self.aabb = photographed, aabb
+        axes = [np.linspace(aabb[0, axis], aabb[1, axis], nodes) for axis in range(3)]
+        self._coarse = photographed.scene.signed_distance(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1))
+        self._cell = (aabb[1] - aabb[0]) / (nodes - 1)
 
-def label_positions(
-    photographed: PhotographedScene, positions: NDArray[np.float64], field_pitch: float, aabb: NDArray[np.float64]
-) -> NDArray[np.uint8]:
-    """Three-valued labels ``(...)`` of world ``positions (..., 3)``; see the module's text."""
-    flat = positions.reshape(-1, 3)
-    distance = _distances(photographed.scene, flat, FREE_BAND * field_pitch, aabb)
-    labels = np.full(len(flat), IGNORE_LABEL, dtype=np.uint8)
-    labels[distance > FREE_BAND * field_pitch] = FREE_LABEL
-    near = np.flatnonzero(np.abs(distance) <= SURFACE_BAND * field_pitch)
-    relaxed = photographed.depth_maps + 2.0 * field_pitch
-    seen = photographed.true_cameras.view_count(flat[near], depth_maps=relaxed, tolerance=0.02) > 0
-    labels[near[seen]] = SURFACE_LABEL
-    labels[~contains(aabb, flat)] = IGNORE_LABEL
-    return labels.reshape(positions.shape[:-1])
+    def distances(self, points: NDArray[np.float64], margin: float) -> NDArray[np.float64]:
+        """Signed distance of ``points (N, 3)``: exact where it is at most ``margin``, else some value beyond it."""
+        index = np.rint((points - self.aabb[0]) / self._cell).astype(np.int64)
+        index = np.clip(index, 0, np.array(self._coarse.shape) - 1)
+        distance: NDArray[np.float64] = self._coarse[index[:, 0], index[:, 1], index[:, 2]]
+        slack = np.linalg.norm(points - (self.aabb[0] + index * self._cell), axis=1)
+        close = np.flatnonzero(np.abs(distance) - slack <= margin)
+        distance[close] = self.photographed.scene.signed_distance(points[close])
+        return distance
+
+    def labels(self, positions: NDArray[np.float64], field_pitch: float) -> NDArray[np.uint8]:
+        """Three-valued labels ``(...)`` of world ``positions (..., 3)``; see the module's text."""
+        labels = np.full(positions.shape[:-1], IGNORE_LABEL, dtype=np.uint8)
+        inside = contains(self.aabb, positions)
+        flat = positions[inside]
+        distance = self.distances(flat, FREE_BAND * field_pitch)
+        found = np.full(len(flat), IGNORE_LABEL, dtype=np.uint8)
+        found[distance > FREE_BAND * field_pitch] = FREE_LABEL
+        near = np.flatnonzero(np.abs(distance) <= SURFACE_BAND * field_pitch)
+        relaxed = self.photographed.depth_maps + 2.0 * field_pitch
+        seen = self.photographed.true_cameras.view_count(flat[near], depth_maps=relaxed, tolerance=0.02) > 0
+        found[near[seen]] = SURFACE_LABEL
+        labels[inside] = found
+        return labels
 
 
 def severity_of(inputs: NDArray[np.float32], labels: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -117,7 +135,7 @@ def _propose(rng: np.random.Generator, field: RadianceField, count: int) -> NDAr
     import torch
 
     aabb = field.aabb
-    candidates = rng.uniform(aabb[0], aabb[1], size=(60000, 3))
+    candidates = rng.uniform(aabb[0], aabb[1], size=(60_000, 3))
     with torch.no_grad():
         density = field.density_fn(torch.from_numpy(candidates).float()).numpy()[:, 0]
     opacity = opacity_from_density(density, field.field_pitch)
@@ -129,14 +147,15 @@ def _propose(rng: np.random.Generator, field: RadianceField, count: int) -> NDAr
 
 
 def harvest_cubes(
-    rng: np.random.Generator, field: RadianceField, photographed: PhotographedScene, config: HarvestConfig
+    rng: np.random.Generator, field: RadianceField, truth: Truth, config: HarvestConfig
 ) -> dict[str, NDArray[Any]]:
     """Cut ``config.cubes`` cubes out of a fitted field and label them: a shard's arrays, less ``group``."""
     import torch
 
     count = config.cubes
     centers = _propose(rng, field, count)
-    pitches = field.field_pitch * np.exp(rng.uniform(*np.log(config.voxel_pitch), size=count))
+    low, high = np.log(config.voxel_pitch)
+    pitches = field.field_pitch * np.exp(rng.uniform(low, high, size=count))
     edges = pitches * RESOLUTION
     rotations = random_rotations(rng, count)
     rotations[rng.random(count) >= config.rotated_share] = np.eye(3)
@@ -146,7 +165,7 @@ def harvest_cubes(
     assumed_pitch = field.field_pitch * np.exp(rng.uniform(-0.3, 0.3, size=(count, 1, 1, 1)))
     inputs = signed_from_opacity(opacity_from_density(density, assumed_pitch)).astype(np.float32)
     inputs[~contains(field.aabb, lattice)] = EMPTY
-    labels = label_positions(photographed, lattice, field.field_pitch, field.aabb)
+    labels = truth.labels(lattice, field.field_pitch)
     return {
         "inputs": quantize_signed(inputs),
         "labels": pack_labels(labels),
@@ -157,7 +176,6 @@ def harvest_cubes(
 
 def harvest_scene(seed: int, index: int, config: HarvestConfig) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """Build, photograph, fit and cut scene ``index``: shard arrays and provenance. Depends on (seed, index) alone."""
-    import torch
 
     from ..fields.radiance import RadianceConfig, RadianceField
     from ..fields.rendering import Sampling
@@ -170,7 +188,6 @@ def harvest_scene(seed: int, index: int, config: HarvestConfig) -> tuple[dict[st
     photographed = photograph(rng, random_scene(rng), count=photos, width=width, height=width * 3 // 4)
     resolution = int(rng.choice(config.resolutions))
     steps = int(np.exp(rng.uniform(*np.log(config.steps))))
-    torch.manual_seed(seed * 1_000_003 + index)
     opacity = float(np.exp(rng.uniform(np.log(0.002), np.log(0.03))))
     field = RadianceField(RadianceConfig(resolution, max(48, resolution * 3 // 4), opacity))
     samples = max(48, round(2.4 / field.field_pitch))
@@ -179,19 +196,17 @@ def harvest_scene(seed: int, index: int, config: HarvestConfig) -> tuple[dict[st
         distortion_weight=float(rng.choice([0.0, 0.002, 0.01])),
         sampling=Sampling(near_samples=samples, far_samples=max(12, samples // 4)),
     )
-    parts = []
-    early = max(60, steps // 4)
-    for fine_tune, budget in ((False, early), (True, steps - early)):
-        report = train_field(
-            field,
-            photographed.cameras,
-            photographed.images,
-            steps=budget,
-            seed=index,
-            config=fitting,
-            fine_tune=fine_tune,
-        )
-        parts.append(harvest_cubes(rng, field, photographed, config))
+    truth = Truth(photographed, field.aabb)
+    parts: list[dict[str, NDArray[Any]]] = []
+
+    def snapshot(fitted: RadianceField, step: int) -> None:
+        if step == round(EARLY * steps):
+            parts.append(harvest_cubes(rng, fitted, truth, config))
+
+    report = train_field(
+        field, photographed.cameras, photographed.images, steps=steps, seed=index, config=fitting, regularizer=snapshot
+    )
+    parts.append(harvest_cubes(rng, field, truth, config))
     arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     arrays["group"] = np.full(len(arrays["inputs"]), index, dtype=np.int32)
     provenance = {
@@ -202,12 +217,50 @@ def harvest_scene(seed: int, index: int, config: HarvestConfig) -> tuple[dict[st
     return arrays, provenance
 
 
-def _work(folder: str, seed: int, index: int, config: HarvestConfig) -> tuple[int, str]:
-    import torch
+def room_scene(seed: int, index: int, config: HarvestConfig) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    """Cubes of scene ``index`` as a perfect field would show them, with synthetic corruption; nothing is fitted.
 
-    torch.set_num_threads(1)
+    Whole rooms at the pitch of a field's cells: several things in a cube, thin legs, walls.
+    """
+    from ..fields.scenes import random_scene
+    from .compose import shell_from_distance
+    from .curate import damage
+    from .recipe import load_recipe
+
+    rng, recipe = np.random.default_rng([seed, index, 1]), load_recipe("rooms")
+    scene, aabb = random_scene(rng), np.array([[-1.0] * 3, [1.0] * 3])
+    count = config.cubes
+    low, high = np.log(config.room_pitch)
+    edges = RESOLUTION * np.exp(rng.uniform(low, high, size=count))
+    candidates = rng.uniform(aabb[0], aabb[1], size=(12 * count, 3))
+    close = np.abs(scene.signed_distance(candidates)) < 0.1
+    centers = np.concatenate([candidates[close], candidates[~close]])[:count]
+    rotations = random_rotations(rng, count)
+    rotations[rng.random(count) >= config.rotated_share] = np.eye(3)
+    pairs = []
+    for center, edge, rotation in zip(centers, edges, rotations):
+        distance = scene.signed_distance(CubeFrame(center, float(edge), rotation).lattice())
+        clean = shell_from_distance(distance, thickness=float(rng.uniform(*recipe.shell_thickness)))
+        clean |= (distance < 0) & (rng.random() < recipe.solid_share)
+        pairs.append(damage(rng, clean, recipe))
+    arrays: dict[str, NDArray[Any]] = {
+        "inputs": quantize_signed(np.stack([signed for signed, _, _ in pairs])),
+        "labels": pack_labels(np.stack([labels for _, labels, _ in pairs])),
+        "severity": np.array([severity for _, _, severity in pairs], dtype=np.float32),
+        "edge_fraction": (edges / scene_extent(aabb)).astype(np.float32),
+        "group": np.full(count, index, dtype=np.int32),
+    }
+    provenance: dict[str, Any] = {"recipe": "rooms", "seed": seed, "scene": index, "config": dataclasses.asdict(config)}
+    return arrays, provenance | {"licence": "generated"}
+
+
+def _work(folder: str, seed: int, index: int, config: HarvestConfig, fit: bool) -> tuple[int, str]:
     try:
-        arrays, provenance = harvest_scene(seed, index, config)
+        if fit:
+            import torch
+
+            torch.set_num_threads(1)
+        arrays, provenance = (harvest_scene if fit else room_scene)(seed, index, config)
     except RuntimeError as error:  # a scene without a free path; reported, not fatal
         return index, str(error)
     write_shard(Path(folder) / f"scene-{index:05d}", arrays, provenance)
@@ -222,12 +275,14 @@ def harvest(
     first: int = 0,
     workers: int = 1,
     config: HarvestConfig | None = None,
+    fit: bool = True,
     progress: bool = False,
     log: Callable[[str], None] | None = None,
 ) -> int:
     """Harvest scenes ``first .. first + scenes - 1``, one shard each; those already there are skipped.
 
-    A run can be killed at any time and started again. ``log`` hears of scenes that were given up.
+    A run can be killed at any time and started again. Without ``fit``, cubes are of perfect fields with synthetic
+    corruption (:func:`room_scene`): quick, and needs no torch. ``log`` hears of scenes that were given up.
 
     Returns:
         The number of pairs now in ``out``.
@@ -246,7 +301,7 @@ def harvest(
         tqdm(total=len(todo), disable=not progress, unit="scene") as bar,
     ):
         for index, problem in (
-            pool.map(_work, *zip(*((str(folder), seed, index, config) for index in todo))) if todo else ()
+            pool.map(_work, *zip(*((str(folder), seed, index, config, fit) for index in todo))) if todo else ()
         ):
             if problem and log is not None:
                 log(f"scene {index}: {problem}")

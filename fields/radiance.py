@@ -83,19 +83,24 @@ class RadianceField(torch.nn.Module):
     @property
     def resolution(self) -> int:
         """Density nodes along an axis, now (training refines it)."""
-        return round(len(self.density_table) ** (1 / 3))
+        side: int = round(self.density_table.shape[0] ** (1 / 3))
+        return side
 
     @property
     def color_resolution(self) -> int:
         """Colour nodes along an axis, now."""
-        return round(len(self.color_table) ** (1 / 3))
+        side: int = round(self.color_table.shape[0] ** (1 / 3))
+        return side
 
     def _grid_coordinates(self, positions: Tensor, resolution: int) -> Tensor:
-        local = contract(positions) if self.config.contract else positions
+        local = contract(positions) if self.config.contract else positions.clamp(-self.half_side, self.half_side)
         return (local + self.half_side) * ((resolution - 1) / (2.0 * self.half_side))
 
     def density_fn(self, positions: Tensor) -> Tensor:
-        """Density per scene unit at ``positions (..., 3)``: ``(..., 1)``, >= 0; 0 outside an uncontracted box."""
+        """Density per scene unit at ``positions (..., 3)``: ``(..., 1)``, >= 0; 0 outside an uncontracted box.
+
+        Positions that are NaN, or infinite in a contracted field, give NaN.
+        """
         flat = positions.reshape(-1, 3).to(self.density_table.dtype)
         raw = trilinear(self.density_table, self._grid_coordinates(flat, self.resolution), self.resolution)
         density = torch.nn.functional.softplus(raw) / self.field_pitch

@@ -26,8 +26,8 @@ class Sampling:
     near: float = 0.05
     middle: float = 2.4
     far: float = 100.0
-    near_samples: int = 112
-    far_samples: int = 32
+    near_samples: int = 96
+    far_samples: int = 24
     minimal_weight: float = 1e-3
 
     def edges(self) -> Tensor:
@@ -121,12 +121,12 @@ def render_view(
     """
     sampling = sampling or Sampling()
     origins, directions = cameras.rays(index)
-    rays = (torch.from_numpy(item.reshape(-1, 3)).float() for item in (origins, directions))
+    starts, towards = (torch.from_numpy(item.reshape(-1, 3)).float() for item in (origins, directions))
     parts = []
-    for start, toward in zip(*(item.split(chunk) for item in rays)):
+    for start, toward in zip(torch.split(starts, chunk), torch.split(towards, chunk)):
         rendering = render_rays(field, start, toward, sampling)
         rgb = rendering.rgb + (1.0 - rendering.accumulation[:, None]) * background
         parts.append((rgb, median_distance(rendering), rendering.accumulation))
     shape = (cameras.height, cameras.width)
-    rgb, depth, accumulation = (torch.cat(column).numpy() for column in zip(*parts))
-    return {"rgb": rgb.reshape(*shape, 3), "depth": depth.reshape(shape), "accumulation": accumulation.reshape(shape)}
+    color, depth, accumulation = (torch.cat(column).numpy() for column in zip(*parts))
+    return {"rgb": color.reshape(*shape, 3), "depth": depth.reshape(shape), "accumulation": accumulation.reshape(shape)}

@@ -263,7 +263,7 @@ def photograph(
     intrinsics = np.array([focal, focal, width / 2, height / 2])
     cameras = Cameras.create(poses, intrinsics, width, height)
     exposure = (
-        1.0 + rng.normal(0, rng.uniform(0, 0.06), size=(count, 1, 1, 3)) + rng.normal(0, 0.03, size=(count, 1, 1, 1))
+        1.0 + rng.normal(0, rng.uniform(0, 0.03), size=(count, 1, 1, 3)) + rng.normal(0, 0.015, size=(count, 1, 1, 1))
     )
     noise = rng.uniform(0.0, 0.015)
     images = np.zeros((count, height, width, 3), dtype=np.float32)
@@ -287,4 +287,5 @@ def _small_rotations(axes: Array) -> Array:
     x, y, z = (axes / np.maximum(angle[:, :, 0], 1e-12)).T
     zero = np.zeros_like(x)
     cross = np.moveaxis(np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]), -1, 0)
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    rotations: Array = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    return rotations

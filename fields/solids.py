@@ -52,15 +52,18 @@ class Texture:
         """``(N, 3)`` at ``positions (N, 3)``."""
         mix = PATTERNS[self.pattern](positions / self.wavelength + self.phase)[:, None]
         fine = _noise(positions * (1.4 / self.wavelength) + 3.1 * self.phase)[:, None] - 0.5
-        return np.clip(self.first + (self.second - self.first) * mix + self.grain * fine, 0.0, 1.0)
+        color: Array = np.clip(self.first + (self.second - self.first) * mix + self.grain * fine, 0.0, 1.0)
+        return color
 
 
 def _checker(p: Array) -> Array:
-    return (np.floor(p + 1e-4).sum(axis=1) % 2).astype(np.float64)
+    parity: Array = np.floor(p + 1e-4).sum(axis=1) % 2
+    return parity
 
 
 def _stripes(p: Array) -> Array:
-    return (np.sin(2 * np.pi * (p @ np.array([0.8, 0.35, 0.48]))) > 0).astype(np.float64)
+    bright: Array = np.sin(2 * np.pi * (p @ np.array([0.8, 0.35, 0.48]))) > 0
+    return bright.astype(np.float64)
 
 
 def _noise(p: Array) -> Array:
@@ -73,7 +76,8 @@ def _noise(p: Array) -> Array:
             * np.sin(5.3 * q[:, 1] + 2.7 * np.sin(3.1 * q[:, 2]))
             + np.sin(4.7 * q[:, 2] + 2.9 * np.sin(1.9 * q[:, 0]))
         ) / 1.6**octave
-    return 0.5 + 0.5 * np.tanh(total)
+    mix: Array = 0.5 + 0.5 * np.tanh(total)
+    return mix
 
 
 PATTERNS: dict[str, Callable[[Array], Array]] = {
@@ -127,7 +131,10 @@ class SolidScene:
     def nearest(self, positions: Array, *, chunk: int = 8192) -> tuple[Array, NDArray[np.int64]]:
         """Signed distance to the union and which solid is nearest, each ``(N,)``.
 
-        A solid is only evaluated where its bounding ball could bring the minimum down: exact, and fast.
+        A solid is only evaluated where its bounding ball could bring the minimum down. The sign is that of
+        the plain minimum over all solids and so is the value, where every shape's distance is exact; a shape
+        that only bounds its distance (the ellipsoid) may be passed over where its ball is farther than another
+        solid: the value then lies between the plain minimum and the true distance.
         """
         if len(positions) <= chunk:
             return self._nearest(positions)
@@ -157,27 +164,36 @@ class SolidScene:
         flat = np.asarray(positions, dtype=np.float64).reshape(-1, 3)
         return self.nearest(flat)[0].reshape(positions.shape[:-1])
 
-    def trace(self, origins: Array, directions: Array, *, far: float = 60.0, steps: int = 96) -> Array:
-        """Distance along unit rays ``(N, 3)`` to the first surface, ``(N,)``; inf where there is none."""
+    def trace(self, origins: Array, directions: Array, *, far: float = 60.0, steps: int = 256) -> Array:
+        """Distance along unit rays ``(N, 3)`` to the first surface, ``(N,)``; inf where there is none before ``far``.
+
+        A ray has arrived within ``5e-4 + 2e-4 * distance`` of a surface. One that is still on its way after
+        ``steps`` counts as a hit only if it grazes a surface at that moment, to within ten times as much.
+        """
         distance = np.zeros(len(origins))
         hit = np.zeros(len(origins), dtype=bool)
         active = np.arange(len(origins))
         for _ in range(steps):
             gap = self.nearest(origins[active] + distance[active, None] * directions[active])[0]
             distance[active] += gap
-            arrived = gap < 5e-4 + 2e-4 * distance[active]
+            reach = 5e-4 + 2e-4 * distance[active]
+            arrived = gap < reach
             hit[active[arrived]] = True
-            active = active[~arrived & (distance[active] < far)]
+            going = ~arrived & (distance[active] < far)
+            grazing = active[going & (gap < 10.0 * reach)]
+            active = active[going]
             if not len(active):
                 break
-        hit[active] = True  # grazing rays that ran out of steps are on a surface to within a few thousandths
+        else:
+            hit[grazing] = True
         return np.where(hit & (distance < far), distance, np.inf)
 
     def normals(self, positions: Array, *, step: float = 1e-3) -> Array:
         """Unit outward normals ``(N, 3)`` by central differences on a tetrahedron."""
         corners = np.array([[1, -1, -1], [-1, -1, 1], [-1, 1, -1], [1, 1, 1]], dtype=np.float64)
         total = sum(corner * self.nearest(positions + step * corner)[0][:, None] for corner in corners)
-        return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
+        normals: Array = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
+        return normals
 
     def shade(self, positions: Array, directions: Array) -> Array:
         """Colour ``(N, 3)`` in [0, 1] of surface points seen along unit ``directions``: Lambert plus a gloss lobe."""

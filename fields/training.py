@@ -60,15 +60,20 @@ def gather_rays(cameras: Cameras, images: NDArray[np.float32]) -> tuple[Tensor, 
     """All pixels of all photos: origins, unit directions, colours, each ``(pixels, 3)`` float32.
 
     Raises:
-        ValueError: ``images`` is not ``(N, height, width, 3)`` for the N cameras.
+        ValueError: ``images`` is not ``(N, height, width, 3)`` for the N cameras, or not floating point.
     """
     expected = (len(cameras), cameras.height, cameras.width, 3)
     if images.shape != expected:
         raise ValueError(f"gather_rays: images must have shape {expected}, got {images.shape}")
+    if images.dtype.kind != "f":
+        raise ValueError(f"gather_rays: images must be floating point in [0, 1], got dtype {images.dtype}")
     rays = [cameras.rays(index) for index in range(len(cameras))]
     origins, directions = (np.concatenate([ray[part].reshape(-1, 3) for ray in rays]) for part in (0, 1))
-    tensors = (torch.from_numpy(np.ascontiguousarray(item, dtype=np.float32)) for item in (origins, directions))
-    return (*tensors, torch.from_numpy(np.ascontiguousarray(images.reshape(-1, 3))))
+    starts, towards, colors = (
+        torch.from_numpy(np.ascontiguousarray(item, dtype=np.float32))
+        for item in (origins, directions, images.reshape(-1, 3))
+    )
+    return starts, towards, colors
 
 
 class _Progress:
@@ -77,6 +82,10 @@ class _Progress:
     def __init__(self, steps: int | None, seconds: float | None) -> None:
         if steps is None and seconds is None:
             raise ValueError("train_field: give steps or seconds (or both)")
+        if steps is not None and steps < 1:
+            raise ValueError(f"train_field: steps must be >= 1, got {steps}")
+        if seconds is not None and not seconds > 0:
+            raise ValueError(f"train_field: seconds must be > 0, got {seconds}")
         self.steps, self.seconds, self.start = steps, seconds, time.perf_counter()
 
     def __call__(self, step: int) -> float:
@@ -92,7 +101,8 @@ def _optimizer(field: RadianceField, rate: float) -> torch.optim.Adam:
 def _set_stage(field: RadianceField, stages: tuple[tuple[float, float], ...], done: float) -> bool:
     """Resample the field if a stage has begun; True if it did."""
     share = max((stage for stage in stages if stage[0] <= done), key=lambda stage: stage[0])[1]
-    density, color = (max(8, round(size * share)) for size in (field.config.resolution, field.config.color_resolution))
+    sizes = (field.config.resolution, field.config.color_resolution)
+    density, color = (min(size, max(8, round(size * share))) for size in sizes)
     if (field.resolution, field.color_resolution) == (density, color):
         return False
     field.resample(density, color)
@@ -127,6 +137,7 @@ def train_field(
         ``steps``, ``seconds``, ``psnr`` (of the last hundred batches).
 
     Raises:
+        ValueError: ``images`` do not fit the cameras, or ``steps`` or ``seconds`` is missing or not positive.
         FloatingPointError: the loss is not finite.
     """
     config = config or TrainingConfig()
@@ -165,7 +176,7 @@ def train_field(
         if not np.isfinite(errors[-1]):
             raise FloatingPointError(f"train_field: the loss is not finite at step {step}")
         optimizer.zero_grad(set_to_none=True)
-        loss.backward()
+        loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
         step += 1
         bar.update(1)

@@ -16,7 +16,7 @@ from torch import Tensor
 
 def _corners(coordinates: Tensor, resolution: int) -> tuple[Tensor, Tensor]:
     """Flat indices ``(N, 8)`` int32 and weights ``(N, 8)`` of the nodes around ``coordinates (N, 3)``."""
-    low = coordinates.floor().clamp_(0, resolution - 2)
+    low = coordinates.floor().nan_to_num_(0.0).clamp_(0, resolution - 2)  # NaN must not become an index
     high_weight = coordinates - low
     low_weight = 1.0 - high_weight
     cell = low.to(torch.int32)
@@ -43,12 +43,12 @@ def _scatter(index: Tensor, weights: Tensor, grad: Tensor, nodes: int) -> Tensor
             )
             return torch.from_numpy(matrix.T @ grad.contiguous().numpy())
     spread = (grad[:, None, :] * weights[:, :, None]).reshape(-1, grad.shape[1])
-    return torch.zeros(nodes, grad.shape[1], device=grad.device).index_add_(0, index.reshape(-1), spread)
+    return grad.new_zeros(nodes, grad.shape[1]).index_add_(0, index.reshape(-1), spread)
 
 
 class _Lookup(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, table: Tensor, index: Tensor, weights: Tensor) -> Tensor:  # type: ignore[override]
+    def forward(ctx: Any, table: Tensor, index: Tensor, weights: Tensor) -> Tensor:
         ctx.save_for_backward(index, weights)
         ctx.nodes = len(table)
         if not len(index):
@@ -62,7 +62,7 @@ class _Lookup(torch.autograd.Function):
             return matrix @ table
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[override]
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
         index, weights = ctx.saved_tensors
         if not len(index):
             return grad.new_zeros(ctx.nodes, grad.shape[1]), None, None
@@ -75,7 +75,7 @@ def trilinear(table: Tensor, coordinates: Tensor, resolution: int) -> Tensor:
     Args:
         table: ``(resolution^3, C)`` float32, node ``[i, j, k]`` at row ``(i * resolution + j) * resolution + k``.
         coordinates: ``(N, 3)`` in node units, [0, resolution - 1]; outside, the edge cell extrapolates.
-            No gradient flows to them.
+            A NaN gives NaN. No gradient flows to them.
 
     Returns:
         ``(N, C)``, differentiable with respect to the table.

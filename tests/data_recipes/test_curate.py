@@ -4,10 +4,10 @@ import shutil
 import numpy as np
 import pytest
 
-from unghost.core.occupancy import FREE_LABEL, SURFACE_LABEL
+from unghost.core.occupancy import FREE_LABEL, IGNORE_LABEL, SURFACE_LABEL
 from unghost.core.shards import ARRAYS, dequantize_signed, read_shard, unpack_labels
 from unghost.data_recipes import curate as module
-from unghost.data_recipes.curate import curate, sample_pair
+from unghost.data_recipes.curate import curate, damage, sample_pair
 from unghost.data_recipes.recipe import Recipe, load_recipe
 
 RECIPE = Recipe(parts=(1, 3))
@@ -29,9 +29,9 @@ def test_shard_rows_are_the_single_samples(tmp_path):
     shard = read_shard(curate(RECIPE, tmp_path, count=12, seed=9)[0], verify=True)
     labels = unpack_labels(np.array(shard.labels))
     for index in (0, 5, 11):
-        signed, clean, severity, fraction, group = sample_pair(RECIPE, index, seed=9)
+        signed, expected, severity, fraction, group = sample_pair(RECIPE, index, seed=9)
         np.testing.assert_allclose(dequantize_signed(shard.inputs[index]), signed, atol=1 / 255 + 1e-6)
-        np.testing.assert_array_equal(labels[index], np.where(clean, SURFACE_LABEL, FREE_LABEL))
+        np.testing.assert_array_equal(labels[index], expected)
         assert (shard.severity[index], shard.edge_fraction[index]) == (np.float32(severity), np.float32(fraction))
         assert shard.group[index] == group == index
 
@@ -48,15 +48,30 @@ def test_shares_of_clean_and_soft_inputs():
     soft = [np.abs(signed).min() < 1 for signed, _, severity, _, _ in pairs if severity > 0]
     assert 0.03 < len(untouched) / 150 < 0.2
     assert 0.35 < np.mean(soft) < 0.65
-    for signed, clean, severity, _, _ in pairs:
+    for signed, labels, severity, _, _ in pairs:
         if severity == 0:
-            np.testing.assert_array_equal(signed, np.where(clean, 1.0, -1.0))
-    assert any(not clean.any() for _, clean, _, _, _ in pairs)  # truly empty: all free
+            np.testing.assert_array_equal(signed, np.where(labels == SURFACE_LABEL, 1.0, -1.0))
+        hard = np.abs(signed).min() == 1
+        assert hard or not (labels == SURFACE_LABEL).any() or (labels == IGNORE_LABEL).any()
+        assert not hard or not (labels == IGNORE_LABEL).any()
+    assert any((labels == FREE_LABEL).all() for _, labels, _, _, _ in pairs)  # truly empty
+
+
+def test_ignored_voxels_are_the_neighbours_of_a_soft_surface():
+    recipe = dataclasses.replace(RECIPE, clean_share=0.0, soft_share=1.0)
+    clean = np.zeros((32, 32, 32), dtype=bool)
+    clean[10, 10, 10] = True
+    _, labels, _ = damage(np.random.default_rng(0), clean, recipe)
+    expected = np.zeros_like(clean, dtype=np.uint8)
+    expected[8:13, 8:13, 8:13] = IGNORE_LABEL
+    expected[9:12, 9:12, 9:12] = SURFACE_LABEL  # soft_dilation is 1
+    np.testing.assert_array_equal(labels, expected)
 
 
 def test_empty_field_encodes_to_minus_one():
-    signed, clean, _, _, _ = sample_pair(dataclasses.replace(RECIPE, empty_share=1.0, clean_share=1.0), 0, seed=0)
-    assert not clean.any()
+    empty = dataclasses.replace(RECIPE, empty_share=1.0, clean_share=1.0)
+    signed, labels, _, _, _ = sample_pair(empty, 0, seed=0)
+    assert (labels == FREE_LABEL).all()
     assert (signed == -1).all()
 
 
