@@ -77,7 +77,7 @@ def capture(results: dict[str, Any]) -> list[str]:
     seeds = len(results["seeds"])
     return [
         f"**A real capture** ({results['capture']}: trained on one sweep of phone photos, scored on another; the "
-        f"paper's masks, depth limit {results['depth_limit']:.2f}, mean of {seeds} seed{'s' if seeds > 1 else ''}):", "",
+        f"paper's masks, depth limit {results['depth_limit']:.2f}, mean of {seeds} seeds):", "",
         *table(head, rows), "", "![photo, (a), (b), (c), colour and depth](docs/results/capture.png)",
     ]  # fmt: skip
 
