@@ -229,11 +229,15 @@ def random_scene(rng: np.random.Generator) -> SolidScene:
 
 
 def look_at(origins: Array, targets: Array) -> Array:
-    """OpenGL camera-to-world ``(N, 3, 4)`` for cameras at ``origins (N, 3)`` facing ``targets (N, 3)``, z up."""
+    """OpenGL camera-to-world ``(N, 3, 4)`` for cameras at ``origins (N, 3)`` facing ``targets (N, 3)``, z up.
+
+    A camera that looks straight up or down has its right along +X.
+    """
     back = origins - targets
     back /= np.linalg.norm(back, axis=1, keepdims=True)
     right = np.cross(np.array([0.0, 0.0, 1.0]), back)
-    right /= np.maximum(np.linalg.norm(right, axis=1, keepdims=True), 1e-9)
+    length = np.linalg.norm(right, axis=1, keepdims=True)
+    right = np.where(length < 1e-9, np.array([1.0, 0.0, 0.0]), right / np.maximum(length, 1e-9))
     return np.stack([right, np.cross(back, right), back, origins], axis=-1)
 
 
