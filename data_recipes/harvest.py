@@ -43,7 +43,6 @@ if TYPE_CHECKING:
 
 SURFACE_BAND, FREE_BAND = 0.75, 1.5  # in field cells
 EARLY = 0.45  # share of the fit at which the first cubes are taken
-EARLY_STEPS = 60  # at the least, before the first snapshot
 
 
 @dataclass(frozen=True)
@@ -76,8 +75,6 @@ class HarvestConfig:
             low, high = getattr(self, name)
             if not 0 < low <= high:
                 raise ValueError(f"HarvestConfig: {name} must be (low, high) with 0 < low <= high, got {(low, high)}")
-        if self.steps[0] <= EARLY_STEPS:
-            raise ValueError(f"HarvestConfig: steps must be > {EARLY_STEPS}, got {self.steps}")
         if min(self.rays, self.cubes) < 1:
             raise ValueError(f"HarvestConfig: rays and cubes must be >= 1, got {self.rays} and {self.cubes}")
 
@@ -176,7 +173,6 @@ def harvest_cubes(
 
 def harvest_scene(seed: int, index: int, config: HarvestConfig) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """Build, photograph, fit and cut scene ``index``: shard arrays and provenance. Depends on (seed, index) alone."""
-
     from ..fields.radiance import RadianceConfig, RadianceField
     from ..fields.rendering import Sampling
     from ..fields.scenes import photograph, random_scene
