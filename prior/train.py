@@ -79,7 +79,7 @@ def _provenance(trainer: Trainer, shards: Sequence[tuple[str | Path, float]], mi
         "batch_size": config.batch_size, "precision": "bf16" if trainer.bf16 else "fp32", "commit": commit(),
         "torch": versions().get("torch", ""), "gflop": round(gflop(config.network), 4),
         "shards": [
-            {"name": Path(path).name, "weight": weight, "cubes": len(shard)}
+            {"source": Path(path).parent.name, "name": Path(path).name, "weight": weight, "cubes": len(shard)}
             for (path, weight), shard in zip(shards, mixture.shards)
         ],
     }  # fmt: skip

@@ -31,7 +31,10 @@ def curate(
     print(f"{count} pairs in {len(shards)} shard{'s' if len(shards) > 1 else ''} under {out}")
 
 
-def harvest(out: Path, scenes: int = 16, seed: int = 0, first: int = 0, workers: int = 1) -> None:
+def harvest(
+    out: Path, scenes: int = 16, seed: int = 0, first: int = 0, workers: int = 1, fit: bool = True,
+    cubes: int | None = None,
+) -> None:  # fmt: skip
     """Fit radiance fields to few photos of synthetic scenes; cut out cubes beside the truth.
 
     Args:
@@ -40,10 +43,16 @@ def harvest(out: Path, scenes: int = 16, seed: int = 0, first: int = 0, workers:
         seed: scene i depends on (seed, i) alone.
         first: number of the first scene.
         workers: processes.
+        fit: fit fields; without it, cubes are of perfect fields with synthetic corruption (quick).
+        cubes: per scene (and snapshot of its field); the default of HarvestConfig if not given.
     """
+    from .data_recipes.harvest import HarvestConfig
     from .data_recipes.harvest import harvest as make
 
-    pairs = make(out, scenes=scenes, seed=seed, first=first, workers=workers, progress=True, log=print)
+    config = HarvestConfig() if cubes is None else HarvestConfig(cubes=cubes)
+    pairs = make(
+        out, scenes=scenes, seed=seed, first=first, workers=workers, config=config, fit=fit, progress=True, log=print
+    )
     print(f"{pairs} pairs under {out}")
 
 

@@ -1,0 +1,89 @@
+"""The model card of the shipped prior, from its manifest and ``docs/results``: no number is typed by hand.
+
+python benchmarks/model_card.py
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from readme import ROOT, load, number, table
+
+from unghost.export.runtime import read_manifest
+
+WEIGHTS = ROOT / "unghost" / "weights"
+COMMANDS = """unghost curate procedural --out out/procedural --count 18000 --seed 0 --workers 2
+unghost curate meshes --out out/meshes --count 12000 --seed 0 --workers 2 --mesh-root MESHES
+unghost harvest --out out/rooms --scenes 60 --first 4 --seed 1000 --cubes 112 --no-fit --workers 2
+unghost harvest --out out/harvest --scenes {scenes} --first 6 --seed 0 --workers 2
+unghost train out/procedural=.27 out/meshes=.18 out/rooms=.2 out/harvest=.35 --out out/run \\
+  --validation procedural=… --validation harvest=… --validation rooms=… --threshold-from harvest \\
+  --max-seconds {seconds:.0f} --batch-size {batch_size} --threads 2 --name unghost-m"""
+
+
+def sources(shards: Iterable[dict[str, Any]]) -> list[list[str]]:
+    """Weight and cubes by folder: harvested shards are one a scene, curated ones are numbered."""
+    total: dict[str, list[float]] = {}
+    for shard in shards:
+        entry = total.setdefault(shard["source"], [0, 0, 0.0])
+        entry[0], entry[1], entry[2] = entry[0] + 1, entry[1] + shard["cubes"], entry[2] + shard["weight"]
+    whole = sum(entry[2] for entry in total.values())
+    return [[name, f"{n}", f"{cubes}", f"{weight / whole:.2f}"] for name, (n, cubes, weight) in total.items()]
+
+
+def card() -> str:
+    manifest = read_manifest(WEIGHTS / "default.onnx")
+    training = manifest.training
+    scenes = sum(shard["source"] == "harvest" for shard in training["shards"])
+    files = [
+        [path.name, f"{path.stat().st_size / 1e6:.2f} MB", f"`{hashlib.sha256(path.read_bytes()).hexdigest()}`"]
+        for path in sorted(WEIGHTS.glob("default.*"))
+    ]
+    scores = [
+        [name, str(row["cubes"]), *(number(row[k]) for k in ("iou_before", "iou", "iou_clean", "ghosts_removed_98"))]
+        for name, row in training["validation"].items()
+    ]
+    head = ("held-out set", "cubes", "IoU before", "IoU after", "IoU on clean input", "ghosts removed at .98 kept")
+    meshes = [
+        [row["set"], row.get("severity", "–"), number(row["iou_before"]), number(row["iou"])]
+        for row in load("denoise")["rows"]
+        if row["method"] == "unghost" and "iou" in row
+    ]
+    lines = [
+        f"# {manifest.name}", "",
+        "A restoration prior: reads one 32³ cube of signed opacity (−1 empty … +1 opaque; bits are a special case), says "
+        "in one step which voxels are surface (`x0_pred`, −1 … +1). `timestep / 999` is the most corruption to expect; "
+        f"from 800 on: any amount. The default is {manifest.default_timestep}.", "",
+        *table(("file", "size", "sha256"), files), "",
+        f"{manifest.parameters} parameters, {training['gflop']:.2f} GFLOP a cube. Removal threshold "
+        f"{manifest.removal_threshold:.3f}: below it lie 2 % of the true surface voxels of held-out harvested cubes.", "",
+        "## Training", "",
+        f"{training['steps']} steps of {training['batch_size']} cubes, {training['seconds'] / 60:.0f} minutes on two CPU "
+        f"cores ({training['precision']}), seed {training['seed']}, commit `{training['commit']}`, torch "
+        f"{training['torch']}.", "",
+        *table(("source", "shards", "cubes", "share of the stream"), sources(training["shards"])), "",
+        "```", COMMANDS.format(scenes=scenes, seconds=training["seconds"], batch_size=training["batch_size"]), "```", "",
+        "The time budget makes the weights depend on the machine's speed; the data do not. Licences: procedural solids, "
+        "synthetic rooms and harvested fields are made by this project; the meshes are CC0-1.0 and MIT-0 only (KayKit, "
+        "Quaternius, Kenney, AWS RoboMaker worlds), `train` split; none of them is in this repository.", "",
+        "## Scores on what it has not seen", "", *table(head, scores), "",
+        "Cubes of meshes of the `test` split and, if harvested ones are listed, of scenes held out "
+        "(`benchmarks/denoise.py`, docs/results/denoise.json):", "",
+        *table(("set", "severity", "IoU before", "IoU after"), meshes), "",
+        "## Limits", "",
+        "One field type (dense trilinear grids) was harvested, from synthetic scenes only. Of the ghosts in such fields "
+        "most stay when nearly all of the true surface must: the cube's opacity alone does not tell them apart. "
+        "Surfaces thinner than a voxel may go.", "",
+    ]  # fmt: skip
+    return "\n".join(lines)
+
+
+def main() -> None:
+    (WEIGHTS / "MODEL_CARD.md").write_text(card(), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
