@@ -34,6 +34,12 @@ Weights = NDArray[np.float32]
 PAIRS = RESOLUTION // 4  # pairs of 16^3 slices, and slices at 8^3
 
 
+def _activate(graph: GraphBuilder, value: str) -> str:
+    from ..prior.network import LEAK
+
+    return graph.node("LeakyRelu", value, alpha=LEAK)
+
+
 def _windows(graph: GraphBuilder, value: str, depth: int, row: int, starts: range, width: int) -> str:
     """Stack ``width`` neighbouring slices for each start: ``(N, depth, row)`` to ``(N, len(starts), width, row)``.
 
@@ -106,7 +112,7 @@ def _block(graph: GraphBuilder, weights: dict[str, Weights], name: str, value: s
 
     hidden = graph.reshape(convolve(value, "first", None), -1, depth, width, depth * depth)
     shifted = graph.node("Add", hidden, graph.reshape(bias, -1, 1, width, 1))
-    return graph.node("Add", convolve(graph.node("Relu", shifted), "second", weights[f"{name}.second.bias"]), value)
+    return graph.node("Add", convolve(_activate(graph, shifted), "second", weights[f"{name}.second.bias"]), value)
 
 
 def _stem(graph: GraphBuilder, weights: dict[str, Weights], channels: int) -> str:
@@ -126,7 +132,8 @@ def _stem(graph: GraphBuilder, weights: dict[str, Weights], channels: int) -> st
     stacked = _windows(graph, features, RESOLUTION, channels * plane, range(-2, RESOLUTION - 2, 4), 8)
     stacked = graph.reshape(stacked, -1, 8 * channels, RESOLUTION, RESOLUTION)
     kernel = _pair_kernel(_stem_kernel(weights["stem.weight"]), 2)
-    return graph.node("Relu", graph.conv(stacked, kernel, np.tile(weights["stem.bias"], 2), stride=2))
+    stem = graph.conv(stacked, kernel, np.tile(weights["stem.bias"], 2), stride=2)
+    return _activate(graph, stem)
 
 
 def _head_kernel(weight: Weights) -> Weights:
@@ -198,7 +205,7 @@ def planar_model(network: RestorationNet) -> Any:
     lifted = graph.reshape(lifted, -1, middle_width, 8, 8)
     middle = run(graph.node("Add", middle, lifted), down + bottom, up)
     lifted = _up(graph, middle, weights["up_fine.mix.weight"], weights["up_fine.bias"])
-    fine = graph.node("Relu", graph.node("Add", fine, lifted))
+    fine = _activate(graph, graph.node("Add", fine, lifted))
     out = _head(graph, weights, fine)
     first = "channels"
     if config.channels > 1:

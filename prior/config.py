@@ -49,7 +49,7 @@ class TrainConfig:
     steps: int = 30_000
     max_seconds: float | None = None
     batch_size: int = 48
-    learning_rate: float = 2e-3
+    learning_rate: float = 1e-3
     final_rate: float = 0.01
     weight_decay: float = 0.01
     warmup_steps: int = 200
