@@ -53,28 +53,31 @@ def card() -> str:
     ]
     lines = [
         f"# {manifest.name}", "",
-        "A restoration prior: reads one 32³ cube of signed opacity (−1 empty … +1 opaque; bits are a special case), says "
-        "in one step which voxels are surface (`x0_pred`, −1 … +1). `timestep / 999` is the most corruption to expect; "
+        "A restoration prior: reads one 32³ cube of signed opacity (−1 empty … +1 opaque; bits are a special case), "
+        "says in one step which voxels are surface (`x0_pred`, −1 … +1). `timestep / 999` is the most corruption to expect; "
         f"from 800 on: any amount. The default is {manifest.default_timestep}.", "",
         *table(("file", "size", "sha256"), files), "",
         f"{manifest.parameters} parameters, {training['gflop']:.2f} GFLOP a cube. Removal threshold "
-        f"{manifest.removal_threshold:.3f}: below it lie 2 % of the true surface voxels of held-out harvested cubes.", "",
+        f"{manifest.removal_threshold:.3f}: below it lie 2 % of the true surface voxels of held-out "
+        "harvested cubes.", "",
         "## Training", "",
-        f"{training['steps']} steps of {training['batch_size']} cubes, {training['seconds'] / 60:.0f} minutes on two CPU "
-        f"cores ({training['precision']}), seed {training['seed']}, commit `{training['commit']}`, torch "
+        f"{training['steps']} steps of {training['batch_size']} cubes, {training['seconds'] / 60:.0f} minutes on two "
+        f"CPU cores ({training['precision']}), seed {training['seed']}, commit `{training['commit']}`, torch "
         f"{training['torch']}.", "",
         *table(("source", "shards", "cubes", "share of the stream"), sources(training["shards"])), "",
-        "```", COMMANDS.format(scenes=scenes, seconds=training["seconds"], batch_size=training["batch_size"]), "```", "",
-        "The time budget makes the weights depend on the machine's speed; the data do not. Licences: procedural solids, "
-        "synthetic rooms and harvested fields are made by this project; the meshes are CC0-1.0 and MIT-0 only (KayKit, "
+        "```",
+        COMMANDS.format(scenes=scenes, seconds=training["seconds"], batch_size=training["batch_size"]),
+        "```", "",
+        "The time budget makes the weights depend on the machine's speed; the data do not. Licences: procedural "
+        "solids, synthetic rooms and harvested fields are made by this project; the meshes are CC0-1.0 and MIT-0 only (KayKit, "
         "Quaternius, Kenney, AWS RoboMaker worlds), `train` split; none of them is in this repository.", "",
         "## Scores on what it has not seen", "", *table(head, scores), "",
         "Cubes of meshes of the `test` split and, if harvested ones are listed, of scenes held out "
         "(`benchmarks/denoise.py`, docs/results/denoise.json):", "",
         *table(("set", "severity", "IoU before", "IoU after"), meshes), "",
         "## Limits", "",
-        "One field type (dense trilinear grids) was harvested, from synthetic scenes only. Of the ghosts in such fields "
-        "most stay when nearly all of the true surface must: the cube's opacity alone does not tell them apart. "
+        "One field type (dense trilinear grids) was harvested, from synthetic scenes only. Of the ghosts in such "
+        "fields most stay when nearly all of the true surface must: the cube's opacity alone does not tell them apart. "
         "Surfaces thinner than a voxel may go.", "",
     ]  # fmt: skip
     return "\n".join(lines)
