@@ -54,8 +54,8 @@ def card() -> str:
     lines = [
         f"# {manifest.name}", "",
         "A restoration prior: reads one 32³ cube of signed opacity (−1 empty … +1 opaque; bits are a special case), "
-        "says in one step which voxels are surface (`x0_pred`, −1 … +1). `timestep / 999` is the most corruption to expect; "
-        f"from 800 on: any amount. The default is {manifest.default_timestep}.", "",
+        "says in one step which voxels are surface (`x0_pred`, −1 … +1). `timestep / 999` is the most corruption to "
+        f"expect; from 800 on: any amount. The default is {manifest.default_timestep}.", "",
         *table(("file", "size", "sha256"), files), "",
         f"{manifest.parameters} parameters, {training['gflop']:.2f} GFLOP a cube. Removal threshold "
         f"{manifest.removal_threshold:.3f}: below it lie 2 % of the true surface voxels of held-out "
@@ -69,8 +69,8 @@ def card() -> str:
         COMMANDS.format(scenes=scenes, seconds=training["seconds"], batch_size=training["batch_size"]),
         "```", "",
         "The time budget makes the weights depend on the machine's speed; the data do not. Licences: procedural "
-        "solids, synthetic rooms and harvested fields are made by this project; the meshes are CC0-1.0 and MIT-0 only (KayKit, "
-        "Quaternius, Kenney, AWS RoboMaker worlds), `train` split; none of them is in this repository.", "",
+        "solids, synthetic rooms and harvested fields are made by this project; the meshes are CC0-1.0 and MIT-0 "
+        "only (KayKit, Quaternius, Kenney, AWS RoboMaker worlds), `train` split; none of them is in this repository.", "",
         "## Scores on what it has not seen", "", *table(head, scores), "",
         "Cubes of meshes of the `test` split and, if harvested ones are listed, of scenes held out "
         "(`benchmarks/denoise.py`, docs/results/denoise.json):", "",
