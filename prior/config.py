@@ -39,7 +39,8 @@ class TrainConfig:
         validate_seconds: between validations; 0 for at the end only.
         validate_cubes: at most so many of each validation shard while training (all of them at the end).
         default_timestep: of the manifest.
-        threshold_from: validation shard whose threshold at .98 of the surface kept goes to the manifest; "" for 0.
+        threshold_from: validation shards, joined by commas; the mean of their thresholds at .98 of the surface kept
+            goes to the manifest; "" for 0.
         init_from: checkpoint (``model.safetensors``) to start from, or "".
     """
 

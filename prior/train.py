@@ -106,17 +106,22 @@ def _log_validation(log: _Log, step: int, scores: Mapping[str, Mapping[str, Any]
         log.scalars(step, flat)
 
 
+def _threshold_names(config: TrainConfig) -> list[str]:
+    return [name.strip() for name in config.threshold_from.split(",") if name.strip()]
+
+
 def _finish(
     trainer: Trainer, out: Path, training: dict[str, Any], validation: Mapping[str, Shard]
 ) -> dict[str, dict[str, Any]]:
     """Score the averaged weights on all validation cubes and write the model with what was found."""
     scores = _validate(trainer, validation, None)
-    chosen = scores.get(trainer.config.threshold_from, {}).get("threshold_98")
+    found = [scores[name]["threshold_98"] for name in _threshold_names(trainer.config)]
+    advised = [threshold for threshold in found if threshold is not None]
     headline = {
         name: {key: row[key] for key in ("cubes", "iou_before", "iou", "iou_clean", "ghosts_removed_98")}
         for name, row in scores.items()
     }
-    manifest = _manifest(trainer, training | {"validation": headline}, 0.0 if chosen is None else chosen)
+    manifest = _manifest(trainer, training | {"validation": headline}, sum(advised) / len(advised) if advised else 0.0)
     save_model(out / MODEL_FILE, trainer.averaged_network(), manifest)
     _write_text(out / "validation.json", json.dumps(scores, indent=1))
     return scores
@@ -205,7 +210,7 @@ def train(
         ValueError: an unreadable shard, an unknown ``threshold_from``.
     """
     named = dict(validation_shards or {})
-    if config.threshold_from and config.threshold_from not in named:
+    if not set(_threshold_names(config)) <= set(named):
         raise ValueError(f"train: threshold_from {config.threshold_from!r} is not among {sorted(named)}")
     mixture = Mixture(train_shards, seed=config.seed)
     validation = {name: read_shard(path) for name, path in named.items()}

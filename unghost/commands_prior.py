@@ -130,7 +130,7 @@ def train(
         precision: auto, bf16 or fp32.
         device: as torch names it.
         threads: of torch; 0 leaves it alone.
-        threshold_from: the validation name that sets the model's removal threshold.
+        threshold_from: validation names (commas between) whose thresholds, averaged, become the model's.
         init_from: a model.safetensors to start from.
         resume: go on where a killed run stopped.
     """
