@@ -28,6 +28,7 @@ class TrainingConfig:
     Attributes:
         rays: rays a step (the paper: 4096).
         learning_rate, final_learning_rate: Adam's, decayed exponentially over the run.
+        fine_tune_learning_rate: held constant with ``fine_tune``.
         distortion_weight: of the mip-NeRF 360 distortion loss (nerfacto has it on by default).
         stages: (share of the run at which it begins, share of the final resolution), coarse to fine.
         sampling: where rays are sampled.
@@ -38,6 +39,7 @@ class TrainingConfig:
     rays: int = 4096
     learning_rate: float = 0.1
     final_learning_rate: float = 0.01
+    fine_tune_learning_rate: float = 0.03
     distortion_weight: float = 0.002
     stages: tuple[tuple[float, float], ...] = ((0.0, 0.4), (0.12, 0.65), (0.3, 1.0))
     sampling: Sampling = _field(default_factory=Sampling)
@@ -128,7 +130,7 @@ def train_field(
     Args:
         steps, seconds: where to stop (whichever comes first); the learning rate decays towards it.
         seed: of the rays, their jitter and the backgrounds.
-        fine_tune: keep the resolution and the final learning rate throughout.
+        fine_tune: keep the resolution, and the fine-tuning rate throughout.
         regularizer: called as ``regularizer(field, step)``; what it returns is added to the loss.
         observer: called with the positions ``(M, 3)`` and densities ``(M,)`` of the rendered samples.
         progress: draw a progress bar.
@@ -153,8 +155,8 @@ def train_field(
     while (share := done(step)) < 1.0:
         if resampled := _set_stage(field, stages, share):
             optimizer = _optimizer(field, config.learning_rate)
-        decay = 1.0 if fine_tune else share
-        rate = config.learning_rate * (config.final_learning_rate / config.learning_rate) ** decay
+        rate = config.learning_rate * (config.final_learning_rate / config.learning_rate) ** share
+        rate = config.fine_tune_learning_rate if fine_tune else rate
         for group in optimizer.param_groups:
             group["lr"] = rate
         batch = torch.randint(len(origins), (config.rays,), generator=generator)
