@@ -19,7 +19,7 @@ unghost curate meshes --out out/meshes --count 12000 --seed 0 --workers 2 --mesh
 unghost harvest --out out/rooms --scenes 60 --first 4 --seed 1000 --cubes 112 --no-fit --workers 2
 unghost harvest --out out/harvest --scenes {scenes} --first 6 --seed 0 --workers 2
 unghost train out/procedural=.27 out/meshes=.18 out/rooms=.2 out/harvest=.35 --out out/run \\
-  --validation procedural=… --validation harvest=… --validation rooms=… --threshold-from procedural,harvest,rooms \\
+  --validation procedural=… --validation harvest=… --validation rooms=… --threshold-from procedural,rooms \\
   --max-seconds {seconds:.0f} --batch-size {batch_size} --learning-rate 1.5e-3 --threads 2 --name unghost-m"""
 
 

@@ -39,7 +39,7 @@ class Manifest:
     family: str = "restoration"
     channels: tuple[str, ...] = ("signed_opacity",)
     resolution: int = RESOLUTION
-    default_timestep: int = 800
+    default_timestep: int = 900
     removal_threshold: float = 0.0
     parameters: int = 0
     body_bytes: int = 0

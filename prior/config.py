@@ -64,7 +64,7 @@ class TrainConfig:
     checkpoint_steps: int = 0
     validate_seconds: float = 300.0
     validate_cubes: int = 512
-    default_timestep: int = 800
+    default_timestep: int = 900
     threshold_from: str = ""
     init_from: str = ""
 

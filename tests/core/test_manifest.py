@@ -5,7 +5,7 @@ import pytest
 from unghost.core.manifest import Manifest
 
 GOLDEN = (
-    '{"body_bytes": 0, "body_sha256": "", "channels": ["signed_opacity"], "default_timestep": 800, '
+    '{"body_bytes": 0, "body_sha256": "", "channels": ["signed_opacity"], "default_timestep": 900, '
     '"family": "restoration", "format": "unghost-denoiser", "format_version": 1, "name": "m", "parameters": 0, '
     '"removal_threshold": 0.0, "resolution": 32, "training": {}}'
 )
