@@ -49,7 +49,7 @@ def scene() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def main() -> None:
     density, table, floaters = scene()
     field = VoxelField(density)
-    optimizer = torch.optim.Adam(field.parameters(), lr=0.05)
+    optimizer = torch.optim.Adam(field.parameters(), lr=0.4)  # raw values reach 60: they have far to go
 
     regularizer = DensityRegularizer(load_denoiser(), aabb=AABB, field_pitch=PITCH, cubes=8)
     for step in range(120):
