@@ -89,8 +89,8 @@ def verdict(rows: dict[str, Row]) -> str:
     if gain > 0:
         return f"DSDS adds {gain:.2f} dB to visibility alone."
     return (
-        f"Here DSDS still **loses** {-gain:.2f} dB to visibility alone: it takes the fog off, and with it true surfaces that "
-        "the field holds only faintly (the bed, the walls)."
+        f"Here DSDS still **loses** {-gain:.2f} dB to visibility alone: it takes the fog off, and with it true "
+        "surfaces that the field holds only faintly (the bed, the walls)."
     )
 
 

@@ -33,7 +33,7 @@ def test_a_constant_field_by_hand(kit, aabb, kind):
     assert level.grad.item() == pytest.approx(0.125, rel=1e-6)
     channels, timestep, fraction = denoiser.calls[0]
     np.testing.assert_allclose(channels.max(), 2 * -math.expm1(-0.25) - 1, rtol=1e-5)
-    assert (timestep == 500).all()
+    assert (timestep == denoiser.manifest.default_timestep).all()
     assert fraction.dtype == np.float32
     assert ((fraction >= 32 * 0.125 * 0.5 / 2 - 1e-6) & (fraction <= 32 * 0.125 * 1.25 / 2 + 1e-6)).all()
 
