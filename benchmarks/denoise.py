@@ -143,7 +143,7 @@ def main() -> None:
         rows += rows_of(prior, "unghost", sets, options)
     speed = measure_speed(prior, batch=40, seconds=8.0)
     rows.append({"method": "unghost", "set": "speed", "threads": options.threads, **speed})
-    command = "python benchmarks/denoise.py --meshes ../shared/data/meshes" + (
+    command = f"python benchmarks/denoise.py --meshes {options.meshes.name} --cubes {options.cubes}" + (
         f" --harvest {options.harvest.name}" if options.harvest else ""
     )
     write_results(
