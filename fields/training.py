@@ -46,6 +46,10 @@ class TrainingConfig:
     skip_from: float = 0.15
     skip_below: float = 1e-3
 
+    def rate_at(self, share: float) -> float:
+        """Learning rate when ``share`` in [0, 1] of the run is done."""
+        return float(self.learning_rate * (self.final_learning_rate / self.learning_rate) ** share)
+
 
 def distortion_loss(rendering: Rendering) -> Tensor:
     """mip-NeRF 360, eq. 15, per ray ``(N,)``, on distances squashed to [0, 1) by ``t / (1 + t)``; O(samples)."""
@@ -111,6 +115,24 @@ def _set_stage(field: RadianceField, stages: tuple[tuple[float, float], ...], do
     return True
 
 
+def _render_batch(
+    field: RadianceField,
+    pixels: tuple[Tensor, Tensor, Tensor],
+    config: TrainingConfig,
+    generator: torch.Generator,
+    occupied: Tensor | None,
+) -> tuple[Rendering, Tensor]:
+    """Random rays rendered before random backgrounds, and their mean squared error."""
+    origins, directions, colors = pixels
+    batch = torch.randint(len(origins), (config.rays,), generator=generator)
+    rendering = render_rays(
+        field, origins[batch], directions[batch], config.sampling, generator=generator, occupied=occupied
+    )
+    background = torch.rand(config.rays, 3, generator=generator)
+    rgb = rendering.rgb + (1.0 - rendering.accumulation[:, None]) * background
+    return rendering, torch.nn.functional.mse_loss(rgb, colors[batch])
+
+
 def train_field(
     field: RadianceField,
     cameras: Cameras,
@@ -144,7 +166,7 @@ def train_field(
     """
     config = config or TrainingConfig()
     generator = torch.Generator().manual_seed(seed)
-    origins, directions, colors = gather_rays(cameras, images)
+    pixels = gather_rays(cameras, images)
     done = _Progress(steps, seconds)
     stages = ((0.0, 1.0),) if fine_tune else config.stages
     _set_stage(field, stages, 0.0)
@@ -155,20 +177,12 @@ def train_field(
     while (share := done(step)) < 1.0:
         if resampled := _set_stage(field, stages, share):
             optimizer = _optimizer(field, config.learning_rate)
-        rate = config.learning_rate * (config.final_learning_rate / config.learning_rate) ** share
-        rate = config.fine_tune_learning_rate if fine_tune else rate
         for group in optimizer.param_groups:
-            group["lr"] = rate
-        batch = torch.randint(len(origins), (config.rays,), generator=generator)
+            group["lr"] = config.fine_tune_learning_rate if fine_tune else config.rate_at(share)
         if step % 16 == 0 or resampled:
             skipping = fine_tune or share >= config.skip_from
             occupied = field.occupied_nodes(config.skip_below) if skipping else None
-        rendering = render_rays(
-            field, origins[batch], directions[batch], config.sampling, generator=generator, occupied=occupied
-        )
-        background = torch.rand(config.rays, 3, generator=generator)
-        rgb = rendering.rgb + (1.0 - rendering.accumulation[:, None]) * background
-        photometric = torch.nn.functional.mse_loss(rgb, colors[batch])
+        rendering, photometric = _render_batch(field, pixels, config, generator, occupied)
         loss = photometric + config.distortion_weight * distortion_loss(rendering).mean()
         if observer is not None:
             observer(rendering.positions.reshape(-1, 3), rendering.density.detach().reshape(-1))
