@@ -69,6 +69,7 @@ def card() -> str:
         "```",
         COMMANDS.format(scenes=scenes, seconds=training["seconds"], batch_size=training["batch_size"]),
         "```", "",
+        "Threshold and default timestep were written into the manifest after the run; the weights are the run's. "
         "The time budget makes the weights depend on the machine's speed; the data do not. Licences: procedural "
         "solids, synthetic rooms and harvested fields are made by this project; the meshes are CC0-1.0 and MIT-0 "
         "only (KayKit, Quaternius, Kenney, AWS RoboMaker worlds), `train` split; none is in this repository.", "",
