@@ -3,9 +3,11 @@
 A radiance field is fitted to a few photos of a synthetic scene; cubes of its opacity are inputs, the
 scene's signed distance gives three-valued labels:
 
-    surface  within three quarters of a field cell of a surface that some training photo sees
+    surface  within three quarters of a field cell of a surface that some training photo sees, and what is
+             opaque up to four cells behind such a surface: a field spreads a surface over several of its cells,
+             and what lies behind the front is part of what makes it opaque
     free     more than one and a half cells outside every solid: whatever is opaque there is a ghost
-    ignore   inside solids and walls, surfaces that no photo sees, the band between, outside the box
+    ignore   the rest of solids and walls, surfaces that no photo sees, the band between, outside the box
 """
 
 from __future__ import annotations
@@ -41,7 +43,7 @@ if TYPE_CHECKING:
     from ..fields.radiance import RadianceField
     from ..fields.scenes import PhotographedScene
 
-SURFACE_BAND, FREE_BAND = 0.75, 1.5  # in field cells
+SURFACE_BAND, FREE_BAND, BEHIND_BAND = 0.75, 1.5, 4.0  # in field cells
 EARLY = 0.45  # share of the fit at which the first cubes are taken
 
 
@@ -61,12 +63,12 @@ class HarvestConfig:
     """
 
     resolutions: tuple[int, ...] = (64, 80, 96, 112, 128, 160)
-    photos: tuple[int, int] = (10, 30)
-    photo_width: tuple[int, int] = (72, 120)
+    photos: tuple[int, int] = (12, 32)
+    photo_width: tuple[int, int] = (80, 128)
     steps: tuple[int, int] = (250, 900)
     rays: int = 1152
-    cubes: int = 224
-    voxel_pitch: tuple[float, float] = (0.5, 1.25)
+    cubes: int = 144
+    voxel_pitch: tuple[float, float] = (0.5, 2.0)
     rotated_share: float = 0.5
     room_pitch: tuple[float, float] = (0.008, 0.05)
 
@@ -91,8 +93,11 @@ class Truth:
         self._coarse = photographed.scene.signed_distance(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1))
         self._cell = (aabb[1] - aabb[0]) / (nodes - 1)
 
-    def distances(self, points: NDArray[np.float64], margin: float) -> NDArray[np.float64]:
-        """Signed distance of ``points (N, 3)``: exact where it is at most ``margin``, else some value beyond it."""
+    def distances(self, points: NDArray[np.float64], margin: float | NDArray[np.float64]) -> NDArray[np.float64]:
+        """Signed distance of ``points (N, 3)``: exact where it is at most ``margin``, else some value beyond it.
+
+        ``margin`` is one number or one for each point ``(N,)``.
+        """
         index = np.rint((points - self.aabb[0]) / self._cell).astype(np.int64)
         index = np.clip(index, 0, np.array(self._coarse.shape) - 1)
         distance: NDArray[np.float64] = self._coarse[index[:, 0], index[:, 1], index[:, 2]]
@@ -101,20 +106,31 @@ class Truth:
         distance[close] = self.photographed.scene.signed_distance(points[close])
         return distance
 
-    def labels(self, positions: NDArray[np.float64], field_pitch: float) -> NDArray[np.uint8]:
-        """Three-valued labels ``(...)`` of world ``positions (..., 3)``; see the module's text."""
+    def labels(
+        self, positions: NDArray[np.float64], field_pitch: float, opaque: NDArray[np.bool_]
+    ) -> NDArray[np.uint8]:
+        """Three-valued labels ``(...)`` of world ``positions (..., 3)``, ``opaque (...)`` in the field or not."""
         labels = np.full(positions.shape[:-1], IGNORE_LABEL, dtype=np.uint8)
         inside = contains(self.aabb, positions)
         flat = positions[inside]
-        distance = self.distances(flat, FREE_BAND * field_pitch)
+        distance = self.distances(flat, np.where(opaque[inside], BEHIND_BAND, FREE_BAND) * field_pitch)
         found = np.full(len(flat), IGNORE_LABEL, dtype=np.uint8)
         found[distance > FREE_BAND * field_pitch] = FREE_LABEL
-        near = np.flatnonzero(np.abs(distance) <= SURFACE_BAND * field_pitch)
-        relaxed = self.photographed.depth_maps + 2.0 * field_pitch
-        seen = self.photographed.true_cameras.view_count(flat[near], depth_maps=relaxed, tolerance=0.02) > 0
-        found[near[seen]] = SURFACE_LABEL
+        near = np.abs(distance) <= SURFACE_BAND * field_pitch
+        behind = opaque[inside] & (distance < 0) & (distance >= -BEHIND_BAND * field_pitch) & ~near
+        for band, reach in ((near, 2.0), (behind, 2.0 + BEHIND_BAND)):
+            chosen = np.flatnonzero(band)
+            found[chosen[self._seen(flat[chosen], reach * field_pitch)]] = SURFACE_LABEL
         labels[inside] = found
         return labels
+
+    def _seen(self, points: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
+        """Whether some photo shows ``points (N, 3)``, or a surface at most ``reach`` in front of them."""
+        relaxed = self.photographed.depth_maps + reach
+        seen: NDArray[np.bool_] = (
+            self.photographed.true_cameras.view_count(points, depth_maps=relaxed, tolerance=0.02) > 0
+        )
+        return seen
 
 
 def severity_of(inputs: NDArray[np.float32], labels: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -162,7 +178,8 @@ def harvest_cubes(
     assumed_pitch = field.field_pitch * np.exp(rng.uniform(-0.3, 0.3, size=(count, 1, 1, 1)))
     inputs = signed_from_opacity(opacity_from_density(density, assumed_pitch)).astype(np.float32)
     inputs[~contains(field.aabb, lattice)] = EMPTY
-    labels = truth.labels(lattice, field.field_pitch)
+    opaque = opacity_from_signed(inputs) > DEFAULT_OPACITY_THRESHOLD
+    labels = truth.labels(lattice, field.field_pitch, opaque)
     return {
         "inputs": quantize_signed(inputs),
         "labels": pack_labels(labels),

@@ -30,16 +30,18 @@ def apply_symmetry(grid: NDArray[Any], symmetry: int) -> NDArray[Any]:
 
 
 BLIND_SEVERITY = 0.8
+HARVEST_RECIPE = "harvest"  # what the provenance of cubes of fitted fields says
 
 
 @dataclass(frozen=True)
 class Batch:
-    """``channels (N, 1, R, R, R)``, ``labels (N, R, R, R)``, ``timestep (N,)`` and ``edge_fraction (N,)``."""
+    """``channels (N, 1, R, R, R)``, ``labels (N, R, R, R)``, the rest ``(N,)``; ``harvested``: of a fitted field."""
 
     channels: NDArray[np.float32]
     labels: NDArray[np.uint8]
     timestep: NDArray[np.int64]
     edge_fraction: NDArray[np.float32]
+    harvested: NDArray[np.bool_]
 
 
 class Mixture:
@@ -85,6 +87,7 @@ class Mixture:
             np.stack(labels),
             timestep_from_severity(least + (1.0 - least) * position),
             np.array([shard.edge_fraction[cube] for shard, cube, _, _ in draws], dtype=np.float32),
+            np.array([shard.provenance.get("recipe") == HARVEST_RECIPE for shard, *_ in draws]),
         )
 
     def stream(self, first_step: int, batch_size: int, *, ahead: int = 2) -> Iterator[Batch]:

@@ -31,6 +31,8 @@ class TrainConfig:
         gradient_clip: largest norm of the gradient.
         ema_decay: of the averaged weights, which are the ones kept.
         interesting_weight: of voxels that are opaque, surface or beside such, in the loss.
+        keep_weight: of true surface in harvested cubes, on top. In fog the odds of a voxel being surface are seldom
+            even; with 8, the decision ``x0_pred < 0`` removes only what is ghost at more than 8 : 1.
         precision: ``auto`` is bf16 where the processor multiplies it natively, else fp32.
         device: as torch names it.
         threads: of torch; 0 leaves it alone.
@@ -57,6 +59,7 @@ class TrainConfig:
     gradient_clip: float = 1.0
     ema_decay: float = 0.999
     interesting_weight: float = 4.0
+    keep_weight: float = 8.0
     precision: Literal["auto", "bf16", "fp32"] = "auto"
     device: str = "cpu"
     threads: int = 0
@@ -69,7 +72,8 @@ class TrainConfig:
     init_from: str = ""
 
     def __post_init__(self) -> None:
-        positive = ("steps", "batch_size", "learning_rate", "gradient_clip", "interesting_weight", "validate_cubes")
+        positive = ("steps", "batch_size", "learning_rate", "gradient_clip", "interesting_weight", "keep_weight",
+                    "validate_cubes")  # fmt: skip
         for name in (*positive, "checkpoint_seconds"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):

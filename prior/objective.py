@@ -35,17 +35,27 @@ def interesting_voxels(signed_opacity: Tensor, labels: Tensor) -> Tensor:
     return seeds
 
 
-def restoration_loss(logits: Tensor, labels: Tensor, signed_opacity: Tensor, *, interesting_weight: float) -> Tensor:
+def restoration_loss(
+    logits: Tensor,
+    labels: Tensor,
+    signed_opacity: Tensor,
+    *,
+    interesting_weight: float,
+    keep_weight: Tensor | None = None,
+) -> Tensor:
     """Weighted mean of the cross-entropy over each cube's valid voxels.
 
     ``sum_v w_v BCE(logit_v, label_v) / sum_v w_v`` over voxels whose label is not "ignore", ``w`` being
     ``interesting_weight`` on :func:`interesting_voxels` and 1 elsewhere: most voxels are trivially empty.
+    Voxels that are opaque in the input and surface in the label count ``keep_weight`` times on top.
 
     Args:
         logits: ``(N, 1, R, R, R)``.
         labels: ``(N, R, R, R)`` uint8: 0 free, 1 surface, 2 ignore.
         signed_opacity: ``(N, 1, R, R, R)``, the input's first channel.
         interesting_weight: > 0.
+        keep_weight: ``(N,)`` > 0; at k, an opaque voxel whose odds of being surface are 1 : k gets a logit of 0.
+            None for 1.
 
     Returns:
         ``(N,)`` float32, 0 for a cube without a valid voxel.
@@ -60,6 +70,9 @@ def restoration_loss(logits: Tensor, labels: Tensor, signed_opacity: Tensor, *, 
     target = (labels == SURFACE_LABEL).float()[:, None]
     with torch.no_grad():
         weight = torch.where(interesting_voxels(signed_opacity, labels), interesting_weight, 1.0)
+        if keep_weight is not None:
+            opaque = opacity_from_signed(signed_opacity) > DEFAULT_OPACITY_THRESHOLD
+            weight = torch.where(opaque & (target > 0), weight * keep_weight.view(-1, 1, 1, 1, 1), weight)
         weight = weight * (labels != IGNORE_LABEL)[:, None]
         total = weight.flatten(1).sum(1)
     losses = functional.binary_cross_entropy_with_logits(logits.float(), target, reduction="none")

@@ -6,6 +6,7 @@ import copy
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -85,7 +86,10 @@ class Trainer:
         times, edges = (torch.from_numpy(v).to(self.device) for v in (batch.timestep, batch.edge_fraction))
         with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=self.bf16):
             logits = self.network.logits(channels, times, edges)
-        loss = restoration_loss(logits, labels, channels, interesting_weight=self.config.interesting_weight).mean()
+        kept = torch.from_numpy(np.where(batch.harvested, self.config.keep_weight, 1.0)).to(channels)
+        loss = restoration_loss(
+            logits, labels, channels, interesting_weight=self.config.interesting_weight, keep_weight=kept
+        ).mean()
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), self.config.gradient_clip)

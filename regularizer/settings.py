@@ -51,8 +51,8 @@ class RegularizerSettings:
     threshold: float | None = None
     fill_threshold: float | None = None
     dsds_weight: float = 0.1
-    visibility_weight: float = 0.1
-    visibility_samples: int = 8192
+    visibility_weight: float = 1.0
+    visibility_samples: int = 32768
     visibility_kind: PointKind = "mixed"
     visibility_reach: float = 1.0
     min_views: int = 1

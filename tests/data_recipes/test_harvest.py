@@ -44,22 +44,24 @@ def photographed():
     return scenes.PhotographedScene(scene, cameras, cameras, images, np.stack(depth).reshape(2, 30, 40))
 
 
-def labels_one_by_one(photographed, positions, pitch):
+def labels_one_by_one(photographed, positions, pitch, opaque):
     """The definition in the module's text, a point at a time, with the plain minimum over all solids."""
     labels = []
-    for position in positions:
+    for position, filled in zip(positions, opaque):
         distance = min(float(solid.distance(position[None])[0]) for solid in photographed.scene.solids)
-        seen = False
+        seen, shallow = False, False
         for index in range(len(photographed.true_cameras)):
             pixel, depth, visible = photographed.true_cameras.project(index, position)
             if visible:
                 row, column = min(int(pixel[1]), 29), min(int(pixel[0]), 39)
-                seen |= bool(depth <= 1.02 * (photographed.depth_maps[index, row, column] + 2 * pitch))
+                front = photographed.depth_maps[index, row, column]
+                seen |= bool(depth <= 1.02 * (front + 2 * pitch))
+                shallow |= bool(depth <= 1.02 * (front + 6 * pitch))
         if not ((position >= -1) & (position <= 1)).all():
             labels.append(IGNORE_LABEL)
         elif distance > 1.5 * pitch:
             labels.append(FREE_LABEL)
-        elif abs(distance) <= 0.75 * pitch and seen:
+        elif seen if abs(distance) <= 0.75 * pitch else filled and shallow and -4 * pitch <= distance < 0:
             labels.append(SURFACE_LABEL)
         else:
             labels.append(IGNORE_LABEL)
@@ -69,10 +71,12 @@ def labels_one_by_one(photographed, positions, pitch):
 @pytest.mark.parametrize("pitch", [0.02, 0.06])
 @pytest.mark.parametrize("nodes", [8, 64])
 def test_labels_follow_their_definition(photographed, pitch, nodes):
-    positions = np.random.default_rng(1).uniform(-1.1, 1.1, size=(2500, 3))
-    labels = Truth(photographed, AABB, nodes=nodes).labels(positions, pitch)
+    rng = np.random.default_rng(1)
+    positions = rng.uniform(-1.1, 1.1, size=(2500, 3))
+    opaque = rng.random(2500) < 0.5
+    labels = Truth(photographed, AABB, nodes=nodes).labels(positions, pitch, opaque)
     assert labels.dtype == np.uint8
-    np.testing.assert_array_equal(labels, labels_one_by_one(photographed, positions, pitch))
+    np.testing.assert_array_equal(labels, labels_one_by_one(photographed, positions, pitch, opaque))
     assert set(np.unique(labels)) == {FREE_LABEL, SURFACE_LABEL, IGNORE_LABEL}
 
 
@@ -83,13 +87,19 @@ def test_labels_by_hand(photographed):
     positions = np.stack([
         ball + 0.3 * toward,  # the skin that the cameras see
         ball + np.array([-0.3, 0.0, 0.0]),  # the skin that they do not
-        ball,  # inside
+        ball,  # deep inside
+        ball + 0.24 * toward,  # three cells behind the skin that they see
+        ball + np.array([-0.24, 0.0, 0.0]),  # three cells behind the skin that they do not
         ball + 0.32 * toward,  # one cell out: the band between
         np.array([0.0, 0.0, 0.9]),  # air
         np.array([0.0, 0.0, 1.1]),  # air outside the box
-    ]).reshape(2, 3, 3)  # fmt: skip
-    expected = [[SURFACE_LABEL, IGNORE_LABEL, IGNORE_LABEL], [IGNORE_LABEL, FREE_LABEL, IGNORE_LABEL]]
-    np.testing.assert_array_equal(truth.labels(positions, 0.02), expected)
+    ]).reshape(2, 4, 3)  # fmt: skip
+    opaque = np.ones((2, 4), dtype=bool)
+    seen, ignored, free = SURFACE_LABEL, IGNORE_LABEL, FREE_LABEL
+    expected = np.array([[seen, ignored, ignored, seen], [ignored, ignored, free, ignored]])
+    np.testing.assert_array_equal(truth.labels(positions, 0.02, opaque), expected)
+    expected[0, 3] = ignored  # what the field left empty behind the skin is no fault
+    np.testing.assert_array_equal(truth.labels(positions, 0.02, ~opaque), expected)
 
 
 def test_coarse_distances_are_exact_where_it_matters(photographed):

@@ -87,6 +87,15 @@ def test_values_come_from_the_shard(shard_paths):
     assert batch.edge_fraction[0] == shard.edge_fraction[cube]
 
 
+def test_harvested_cubes_are_marked(shard_paths, tmp_path):
+    shard = read_shard(shard_paths["a"])
+    names = ("inputs", "labels", "severity", "edge_fraction", "group")
+    arrays = {name: np.array(getattr(shard, name)) for name in names}
+    write_shard(tmp_path / "fitted", arrays, {"recipe": "harvest", "scene": 3})
+    assert Mixture([(tmp_path / "fitted", 1.0)], seed=0).batch(0, 4).harvested.tolist() == [True] * 4
+    assert Mixture([(shard_paths["a"], 1.0)], seed=0).batch(0, 4).harvested.tolist() == [False] * 4
+
+
 def test_errors(shard_paths, tmp_path):
     with pytest.raises(ValueError, match="at least one"):
         Mixture([], seed=0)

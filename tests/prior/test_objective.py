@@ -66,6 +66,34 @@ def test_is_per_sample_and_leaves_inputs():
     assert all(torch.equal(a, b) for a, b in zip(kept, (logits, labels, signed)))
 
 
+def test_keep_weight_acts_on_opaque_surface_alone():
+    signed, labels = empty_case()
+    labels[0, 4, 4, 4] = labels[0, 4, 4, 5] = 1
+    signed[0, 0, 4, 4, 4] = signed[0, 0, 1, 1, 1] = 0.5  # true surface that is there, and a ghost
+    logits = torch.zeros_like(signed, requires_grad=True)
+    gradients = []
+    for keep in (None, torch.tensor([5.0])):
+        loss = restoration_loss(logits, labels, signed, interesting_weight=4.0, keep_weight=keep)
+        (gradient,) = torch.autograd.grad(loss.sum(), logits)
+        gradients.append(gradient[0, 0] / gradient[0, 0, 7, 7, 7])  # in units of a plain empty voxel's
+    ratio = gradients[1] / gradients[0]
+    assert ratio[4, 4, 4].item() == pytest.approx(5.0)
+    ratio[4, 4, 4] = 1.0
+    assert torch.allclose(ratio, torch.ones_like(ratio))
+
+
+def test_keep_weight_moves_the_decision_to_its_odds():
+    """A constant logit fitted to 9 ghosts for each true voxel ends at x0_pred = 0 if the true one weighs 9."""
+    signed, labels = torch.full((1, 1, 10, 10, 10), 0.5), torch.zeros(1, 10, 10, 10, dtype=torch.uint8)
+    labels.view(-1)[::10] = 1
+    logit = torch.zeros((), requires_grad=True)
+    loss = restoration_loss(
+        logit.expand_as(signed), labels, signed, interesting_weight=4.0, keep_weight=torch.tensor([9.0])
+    )
+    loss.sum().backward()
+    assert logit.grad.abs() < 1e-6
+
+
 def test_errors():
     signed, labels = empty_case()
     with pytest.raises(ValueError, match="interesting_weight must be > 0"):
