@@ -37,7 +37,14 @@ from ..core.occupancy import (
     opacity_from_signed,
     signed_from_opacity,
 )
-from ..core.shards import pack_labels, quantize_signed, read_shard, write_shard
+from ..core.shards import (
+    dequantize_signed,
+    pack_labels,
+    quantize_signed,
+    read_shard,
+    unpack_labels,
+    write_shard,
+)
 
 if TYPE_CHECKING:
     from ..fields.radiance import RadianceField
@@ -60,6 +67,8 @@ class HarvestConfig:
         voxel_pitch: voxel side in field cells, log-uniform.
         rotated_share: share of cubes with a random rotation.
         room_pitch: voxel side of :func:`room_scene`'s cubes, scene units, log-uniform.
+        fewest_opaque, most_ghosts: a fit has failed, and its scene is given up, if a smaller share of the surface is
+            opaque, or a larger share of what is opaque are ghosts.
     """
 
     resolutions: tuple[int, ...] = (64, 80, 96, 112, 128, 160)
@@ -71,6 +80,8 @@ class HarvestConfig:
     voxel_pitch: tuple[float, float] = (0.5, 2.0)
     rotated_share: float = 0.5
     room_pitch: tuple[float, float] = (0.008, 0.05)
+    fewest_opaque: float = 0.1
+    most_ghosts: float = 0.9
 
     def __post_init__(self) -> None:
         for name in ("photos", "photo_width", "steps", "voxel_pitch", "room_pitch"):
@@ -141,6 +152,17 @@ def severity_of(inputs: NDArray[np.float32], labels: NDArray[np.uint8]) -> NDArr
     union = (opaque | surface).sum(axis=(1, 2, 3))
     both = (opaque & surface).sum(axis=(1, 2, 3))
     return (1.0 - np.where(union > 0, both / np.maximum(union, 1), 1.0)).astype(np.float32)
+
+
+def check_fit(inputs: NDArray[np.float32], labels: NDArray[np.uint8], config: HarvestConfig) -> None:
+    """Raise RuntimeError if a field's cubes (both ``(N, R, R, R)``) hold too little surface, or too many ghosts."""
+    opaque = opacity_from_signed(inputs) > DEFAULT_OPACITY_THRESHOLD
+    surface = labels == SURFACE_LABEL
+    true, ghosts = int((opaque & surface).sum()), int((opaque & (labels == FREE_LABEL)).sum())
+    if true < config.fewest_opaque * surface.sum():
+        raise RuntimeError(f"failed fit: {true / surface.sum():.0%} of the surface is opaque")
+    if ghosts > config.most_ghosts * (true + ghosts):
+        raise RuntimeError(f"failed fit: {ghosts / (true + ghosts):.0%} of what is opaque are ghosts")
 
 
 def _propose(rng: np.random.Generator, field: RadianceField, count: int) -> NDArray[np.float64]:
@@ -222,6 +244,7 @@ def harvest_scene(seed: int, index: int, config: HarvestConfig) -> tuple[dict[st
     parts.append(harvest_cubes(rng, field, truth, config))
     arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     arrays["group"] = np.full(len(arrays["inputs"]), index, dtype=np.int32)
+    check_fit(dequantize_signed(arrays["inputs"]), unpack_labels(arrays["labels"]), config)
     provenance = {
         "recipe": "harvest", "seed": seed, "scene": index, "photos": photos, "photo_width": width, "steps": steps,
         "field": "dense grid", "resolution": resolution, "psnr": round(float(report["psnr"]), 3),
@@ -274,7 +297,7 @@ def _work(folder: str, seed: int, index: int, config: HarvestConfig, fit: bool) 
 
             torch.set_num_threads(1)
         arrays, provenance = (harvest_scene if fit else room_scene)(seed, index, config)
-    except RuntimeError as error:  # a scene without a free path; reported, not fatal
+    except RuntimeError as error:  # a scene without a free path, a failed fit; reported, not fatal
         return index, str(error)
     write_shard(Path(folder) / f"scene-{index:05d}", arrays, provenance)
     return index, ""

@@ -78,6 +78,8 @@ def _provenance(trainer: Trainer, shards: Sequence[tuple[str | Path, float]], mi
         "seed": config.seed, "steps": trainer.step, "seconds": round(trainer.elapsed, 1),
         "batch_size": config.batch_size, "precision": "bf16" if trainer.bf16 else "fp32", "commit": commit(),
         "torch": versions().get("torch", ""), "gflop": round(gflop(config.network), 4),
+        "learning_rate": config.learning_rate, "keep_weight": config.keep_weight,
+        "threshold_from": config.threshold_from, "started_from": trainer.started_from,
         "shards": [
             {"source": Path(path).parent.name, "name": Path(path).name, "weight": weight, "cubes": len(shard)}
             for (path, weight), shard in zip(shards, mixture.shards)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import hashlib
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,10 @@ def _optimizer(network: nn.Module, config: TrainConfig) -> torch.optim.AdamW:
 
 
 class Trainer:
-    """Steps a :class:`RestorationNet`; ``step`` and ``elapsed`` survive :meth:`save` and :meth:`restore`."""
+    """Steps a :class:`RestorationNet`; ``step`` and ``elapsed`` survive :meth:`save` and :meth:`restore`.
+
+    ``started_from`` is the provenance of the weights of ``config.init_from``, or None.
+    """
 
     def __init__(self, config: TrainConfig) -> None:
         self.config = config
@@ -52,11 +56,16 @@ class Trainer:
         with torch.random.fork_rng(devices=[]):  # the initial weights depend on the seed alone
             torch.manual_seed(config.seed)
             network = RestorationNet(config.network)
+        self.started_from: dict[str, Any] | None = None
         if config.init_from:
-            start = load_model(config.init_from).network
-            if start.config != config.network:
-                raise ValueError(f"Trainer: init_from {config.init_from} has another network: {start.config}")
-            network.load_state_dict(start.state_dict())
+            start = load_model(config.init_from)
+            if start.network.config != config.network:
+                raise ValueError(f"Trainer: init_from {config.init_from} has another network: {start.network.config}")
+            network.load_state_dict(start.network.state_dict())
+            kept = ("seed", "steps", "seconds", "batch_size", "learning_rate", "commit", "shards", "started_from")
+            digest = hashlib.sha256(Path(config.init_from).read_bytes()).hexdigest()
+            earlier = {key: value for key, value in start.manifest.training.items() if key in kept}
+            self.started_from = {"name": start.manifest.name, "sha256": digest, **earlier}
         self.network = network.to(self.device).to(memory_format=torch.channels_last_3d)  # type: ignore[call-overload]
         self.optimizer = _optimizer(self.network, config)
         self.average = ExponentialMovingAverage(self.network, decay=config.ema_decay)

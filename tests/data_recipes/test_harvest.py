@@ -18,7 +18,15 @@ solids = pytest.importorskip("unghost.fields.solids")
 
 AABB = np.array([[-1.0] * 3, [1.0] * 3])
 TINY = HarvestConfig(
-    resolutions=(24, 32), photos=(2, 3), photo_width=(16, 20), steps=(10, 14), rays=48, cubes=3, room_pitch=(0.01, 0.05)
+    resolutions=(24, 32),
+    photos=(2, 3),
+    photo_width=(16, 20),
+    steps=(10, 14),
+    rays=48,
+    cubes=3,
+    room_pitch=(0.01, 0.05),
+    fewest_opaque=0.0,
+    most_ghosts=1.0,
 )
 
 
@@ -124,6 +132,22 @@ def test_severity_by_hand():
     inputs[3, 0] = -0.85  # opacity 0.075: not opaque
     np.testing.assert_allclose(severity_of(inputs, labels), [0.75, 0.0, 1.0, 0.0])
     assert severity_of(inputs[:0], labels[:0]).shape == (0,)
+
+
+def test_failed_fits_are_refused():
+    inputs = np.full((1, 10, 10, 10), -1.0, dtype=np.float32)
+    labels = np.full((1, 10, 10, 10), FREE_LABEL, dtype=np.uint8)
+    labels[0, 0] = SURFACE_LABEL  # a hundred voxels
+    inputs[0, 0, 0] = 0.0  # ten of them opaque
+    inputs[0, 1:9, 0] = 0.0  # and eighty ghosts: 8 to 1
+    module.check_fit(inputs, labels, HarvestConfig())
+    inputs[0, 9, :2] = 0.0  # a hundred ghosts: 10 to 1
+    with pytest.raises(RuntimeError, match="91% of what is opaque are ghosts"):
+        module.check_fit(inputs, labels, HarvestConfig())
+    inputs[0, 0, 0, 0] = -1.0
+    with pytest.raises(RuntimeError, match="9% of the surface is opaque"):
+        module.check_fit(inputs, labels, HarvestConfig())
+    module.check_fit(inputs[:0], labels[:0], HarvestConfig())
 
 
 def test_one_scene_end_to_end_and_again(tmp_path):

@@ -1,4 +1,5 @@
 import dataclasses
+import hashlib
 import math
 
 import numpy as np
@@ -85,11 +86,15 @@ def test_decay_spares_biases_and_gain(tiny_config):
 def test_warm_start(tiny_config, tmp_path):
     torch.manual_seed(9)
     network = RestorationNet(tiny_config.network)
-    save_model(tmp_path / "start.safetensors", network, Manifest(name="start"))
+    path = tmp_path / "start.safetensors"
+    save_model(path, network, Manifest(name="start", training={"steps": 7, "validation": {}}))
     config = dataclasses.replace(tiny_config, init_from=str(tmp_path / "start.safetensors"))
     trainer = Trainer(config)
     assert torch.equal(trainer.network.stem.weight, network.stem.weight)
     assert torch.equal(trainer.average.shadow["stem.weight"], network.stem.weight)
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    assert trainer.started_from == {"name": "start", "sha256": digest, "steps": 7}
+    assert Trainer(tiny_config).started_from is None
     with pytest.raises(ValueError, match="has another network"):
         Trainer(dataclasses.replace(config, network=NetworkConfig(widths=(16, 8, 8))))
 
