@@ -33,6 +33,19 @@ BLIND_SEVERITY = 0.8
 HARVEST_RECIPE = "harvest"  # what the provenance of cubes of fitted fields says
 
 
+DEPTH_JITTER = 0.5  # of the logarithm of a harvested cube's optical depth: a field's cell is known but roughly
+
+
+def _harvested(shard: Shard) -> bool:
+    return bool(shard.provenance.get("recipe") == HARVEST_RECIPE)
+
+
+def scale_depth(signed: NDArray[np.float32], factor: float) -> NDArray[np.float32]:
+    """Signed opacity as it were with ``factor`` times the density: ``o -> 1 - (1 - o)^factor``; -1 and +1 stay."""
+    transparency = np.clip((1.0 - signed) * np.float32(0.5), 0.0, 1.0)
+    return (1.0 - 2.0 * transparency ** np.float32(factor)).astype(np.float32)
+
+
 @dataclass(frozen=True)
 class Batch:
     """``channels (N, 1, R, R, R)``, ``labels (N, R, R, R)``, the rest ``(N,)``; ``harvested``: of a fitted field."""
@@ -47,9 +60,10 @@ class Batch:
 class Mixture:
     """Random access to an endless weighted mixture of shards.
 
-    Sample i draws, from a generator seeded by (seed, i): its shard (by weight), its cube, one of the 48
-    symmetries, and ``t = round(999 u)``, ``u`` uniform in [min(severity, BLIND_SEVERITY), 1]: the timestep says
-    "at most this much corruption", from ``BLIND_SEVERITY`` on "any amount"; a clean cube is seen at every timestep.
+    Sample i draws, from a generator seeded by (seed, i): its shard (by weight), its cube, one of the 48 symmetries (of
+    harvested cubes also a factor on the optical depth), and ``t = round(999 u)``, ``u`` uniform in
+    [min(severity, BLIND_SEVERITY), 1]: the timestep says "at most this much corruption", from ``BLIND_SEVERITY`` on
+    "any amount"; a clean cube is seen at every timestep.
     """
 
     def __init__(self, shards: Sequence[tuple[str | Path, float]], *, seed: int) -> None:
@@ -65,29 +79,35 @@ class Mixture:
         self.seed = seed
         self._cumulative = np.cumsum(weights) / weights.sum()
 
-    def _draw(self, index: int) -> tuple[Shard, int, int, float]:
+    def _draw(self, index: int) -> tuple[Shard, int, int, float, float]:
         rng = np.random.default_rng([self.seed, index])
         choice = int(np.searchsorted(self._cumulative, rng.random(), side="right"))
         shard = self.shards[min(choice, len(self.shards) - 1)]
-        return shard, int(rng.integers(len(shard))), int(rng.integers(len(SYMMETRIES))), float(rng.random())
+        cube, symmetry, position = int(rng.integers(len(shard))), int(rng.integers(len(SYMMETRIES))), rng.random()
+        depth = float(np.exp(rng.uniform(-DEPTH_JITTER, DEPTH_JITTER)))
+        return shard, cube, symmetry, float(position), depth if _harvested(shard) else 1.0
 
     def batch(self, step: int, batch_size: int) -> Batch:
         """Samples ``step * batch_size`` to ``(step + 1) * batch_size``."""
         draws = [self._draw(index) for index in range(step * batch_size, (step + 1) * batch_size)]
-        stored = [apply_symmetry(shard.inputs[cube], symmetry) for shard, cube, symmetry, _ in draws]
+        stored = [apply_symmetry(shard.inputs[cube], symmetry) for shard, cube, symmetry, *_ in draws]
+        signed = dequantize_signed(np.stack(stored))
+        for row, (*_, depth) in enumerate(draws):
+            if depth != 1.0:
+                signed[row] = scale_depth(signed[row], depth)
         labels = [
             apply_symmetry(unpack_labels(shard.labels[cube : cube + 1])[0], symmetry)
-            for shard, cube, symmetry, _ in draws
+            for shard, cube, symmetry, *_ in draws
         ]
-        severity = np.array([shard.severity[cube] for shard, cube, _, _ in draws], dtype=np.float64)
+        severity = np.array([shard.severity[cube] for shard, cube, *_ in draws], dtype=np.float64)
         least = np.minimum(severity, BLIND_SEVERITY)
-        position = np.array([position for *_, position in draws])
+        position = np.array([position for *_, position, _ in draws])
         return Batch(
-            dequantize_signed(np.stack(stored))[:, None],
+            signed[:, None],
             np.stack(labels),
             timestep_from_severity(least + (1.0 - least) * position),
-            np.array([shard.edge_fraction[cube] for shard, cube, _, _ in draws], dtype=np.float32),
-            np.array([shard.provenance.get("recipe") == HARVEST_RECIPE for shard, *_ in draws]),
+            np.array([shard.edge_fraction[cube] for shard, cube, *_ in draws], dtype=np.float32),
+            np.array([_harvested(shard) for shard, *_ in draws]),
         )
 
     def stream(self, first_step: int, batch_size: int, *, ahead: int = 2) -> Iterator[Batch]:

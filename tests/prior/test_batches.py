@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from unghost.core.shards import dequantize_signed, read_shard, unpack_labels, write_shard
-from unghost.prior.batches import BLIND_SEVERITY, SYMMETRIES, Mixture, apply_symmetry
+from unghost.prior.batches import BLIND_SEVERITY, DEPTH_JITTER, SYMMETRIES, Mixture, apply_symmetry, scale_depth
 
 
 def test_symmetries_are_the_48_of_the_cube():
@@ -85,6 +85,34 @@ def test_values_come_from_the_shard(shard_paths):
     assert np.array_equal(batch.channels[0, 0], apply_symmetry(dequantize_signed(shard.inputs[cube]), symmetry))
     assert np.array_equal(batch.labels[0], apply_symmetry(unpack_labels(shard.labels[cube : cube + 1])[0], symmetry))
     assert batch.edge_fraction[0] == shard.edge_fraction[cube]
+
+
+def test_scaled_depth_is_that_of_a_scaled_density():
+    depth = np.array([0.0, 0.1, 1.0, 3.0])
+    signed = (1.0 - 2.0 * np.exp(-depth)).astype(np.float32)
+    for factor in (0.5, 1.0, 2.0):
+        np.testing.assert_allclose(scale_depth(signed, factor), 1.0 - 2.0 * np.exp(-factor * depth), atol=1e-6)
+    assert scale_depth(np.array([-1.0, 1.0], dtype=np.float32), 0.6).tolist() == [-1.0, 1.0]
+
+
+def test_harvested_cubes_alone_get_another_depth(shard_paths, tmp_path):
+    arrays = {
+        "inputs": np.full((2, 32, 32, 32), 64, dtype=np.uint8),  # opacity .25
+        "labels": np.zeros((2, 8192), dtype=np.uint8),
+        "severity": np.zeros(2, dtype=np.float32),
+        "edge_fraction": np.full(2, 0.1, dtype=np.float32),
+        "group": np.zeros(2, dtype=np.int32),
+    }
+    for recipe in ("harvest", "rooms"):
+        write_shard(tmp_path / recipe, arrays, {"recipe": recipe})
+    fitted, rooms = (
+        Mixture([(tmp_path / name, 1.0)], seed=0).batch(0, 40).channels[:, 0, 0, 0, 0] for name in ("harvest", "rooms")
+    )
+    assert np.unique(rooms).tolist() == pytest.approx([64 / 127.5 - 1])
+    factors = np.log((1 - fitted) / 2) / np.log((1 - rooms) / 2)
+    assert len(np.unique(factors)) == 40
+    assert np.abs(np.log(factors)).max() <= DEPTH_JITTER + 1e-6
+    assert np.log(factors).min() < -0.5 * DEPTH_JITTER < 0.5 * DEPTH_JITTER < np.log(factors).max()
 
 
 def test_harvested_cubes_are_marked(shard_paths, tmp_path):
