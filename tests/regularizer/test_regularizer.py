@@ -258,8 +258,9 @@ def test_thresholds_come_from_the_manifest_and_can_be_set(kit, aabb):
         return regularizer(lambda p: level.expand(len(p)))["dsds"].item()
 
     assert run() == pytest.approx(0.25)  # -0.2 < 0: empty
-    assert run(removal_threshold=-0.5) == 0.0  # between removal and filling
-    assert run(removal_threshold=-0.5, threshold=0.0) == pytest.approx(0.25)
+    assert run(removal_threshold=-0.5) == pytest.approx(0.25)  # the paper's rule, whatever clean() is advised
+    assert run(removal_threshold=-0.5, threshold=None) == 0.0  # between removal and filling
+    assert run(threshold=-0.5) == 0.0
 
 
 def test_timestep_schedule(kit, aabb):
