@@ -68,6 +68,11 @@ class MeshFile:
     side_files: tuple[tuple[str, str], ...] = ()
 
 
+def mesh_suffixes() -> tuple[str, ...]:
+    """Suffixes, without the dot, of the mesh formats that could be read if all of their libraries were there."""
+    return tuple(sorted({*_ALONE, *_WITH_SIDES, *_ZIPPED, "xaml"}))
+
+
 def known_formats() -> tuple[str, ...]:
     """Suffixes, without the dot, that can be read with what is installed.
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 
 _MARKS = ((b"\xef\xbb\xbf", "utf-8-sig"), (b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16"))
+MOST_CORNERS = 2000  # of a concave polygon
 _FLATTEST = 1e-9  # smallest singular value over the largest of a node's transform
 
 
@@ -98,9 +99,11 @@ def _concave(fans: Array) -> Array:
 
 def _clip_ears(ring: Array, fan: Array) -> Array:
     """Triangles ``(n - 2, 3, 3)`` of a concave polygon ``(n, 3)``; its fan where no cut is right (it meets itself)."""
-    normal = np.cross(ring, np.roll(ring, -1, axis=0)).sum(axis=0) if len(ring) < 512 else np.zeros(3)
-    drop = int(np.abs(normal).argmax())
-    flat = np.delete(ring - ring[0], drop, axis=1)
+    if len(ring) > MOST_CORNERS:
+        raise MeshRejected(f"a concave polygon of {len(ring)} corners, more than {MOST_CORNERS}")
+    ring = ring - ring[0]
+    normal = np.cross(ring, np.roll(ring, -1, axis=0)).sum(axis=0)
+    flat = np.delete(ring, int(np.abs(normal).argmax()), axis=1)
     x, y = flat[:, 0], flat[:, 1]
     if (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() < 0:
         flat = flat * [1, -1]
@@ -111,21 +114,23 @@ def _clip_ears(ring: Array, fan: Array) -> Array:
             return fan
         ears.append([left[ear - 1], left[ear], left[(ear + 1) % len(left)]])
         del left[ear]
-    triangles: Array = ring[np.array([*ears, left])]
+    triangles: Array = (ring + fan[0, 0])[np.array([*ears, left])]
     return triangles
 
 
 def _is_ear(flat: Array, left: list[int], i: int) -> bool:
-    """Whether corner ``i`` of the remaining counter-clockwise ring is convex with no other corner in its triangle."""
+    """Whether corner ``i`` of the remaining counter-clockwise ring can go: convex, and no other in its triangle."""
     a, b, c = (flat[left[j % len(left)]] for j in (i - 1, i, i + 1))
 
     def side(p: Array, q: Array, r: Array) -> Array:
-        return (q[0] - p[0]) * (r[..., 1] - p[1]) - (q[1] - p[1]) * (r[..., 0] - p[0])
+        area: Array = (q[0] - p[0]) * (r[..., 1] - p[1]) - (q[1] - p[1]) * (r[..., 0] - p[0])
+        return area
 
-    if side(a, b, c) <= 0:
-        return False
-    others = flat[[k for j, k in enumerate(left) if j not in {(i - 1) % len(left), i, (i + 1) % len(left)}]]
-    inside = (side(a, b, others) >= 0) & (side(b, c, others) >= 0) & (side(c, a, others) >= 0)
+    if side(a, b, c) <= 0:  # a straight corner adds no area
+        return bool(side(a, b, c) == 0 and np.dot(b - a, c - b) >= 0)
+    others = flat[left]
+    at_corner = (others == a).all(axis=1) | (others == b).all(axis=1) | (others == c).all(axis=1)
+    inside = (side(a, b, others) >= 0) & (side(b, c, others) >= 0) & (side(c, a, others) >= 0) & ~at_corner
     return not bool(inside.any())
 
 
