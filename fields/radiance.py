@@ -129,6 +129,19 @@ class RadianceField(torch.nn.Module):
         basis = torch.cat([torch.full_like(directions[:, :1], SH_CONSTANT), SH_LINEAR * directions], dim=1)
         return torch.sigmoid(torch.einsum("ncb,nb->nc", coefficients.view(-1, 3, SH_COEFFICIENTS), basis))
 
+    def parameter_groups(self) -> list[tuple[list[torch.nn.Parameter], float]]:
+        """Parameters and their learning rates relative to the run's; see :class:`~.kinds.TrainableField`."""
+        return [(list(self.parameters()), 1.0)]
+
+    def refine(self, share: float) -> bool:
+        """Go to ``share`` in (0, 1] of the configured resolutions; True if that changed them."""
+        sizes = (self.config.resolution, self.config.color_resolution)
+        density, color = (min(size, max(8, round(size * share))) for size in sizes)
+        if (self.resolution, self.color_resolution) == (density, color):
+            return False
+        self.resample(density, color)
+        return True
+
     @torch.no_grad()
     def resample(self, resolution: int, color_resolution: int) -> None:
         """Change both grids' resolution by trilinear interpolation (values are kept, optimizer state is not)."""

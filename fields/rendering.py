@@ -1,8 +1,9 @@
-"""Volume rendering of a :class:`RadianceField`."""
+"""Volume rendering of any :class:`~.kinds.TrainableField`."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -10,7 +11,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..core.cameras import Cameras
-from .radiance import RadianceField
+
+if TYPE_CHECKING:
+    from .kinds import TrainableField
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,7 @@ class Rendering:
 
 
 def render_rays(
-    field: RadianceField,
+    field: TrainableField,
     origins: Tensor,
     directions: Tensor,
     sampling: Sampling,
@@ -66,7 +69,7 @@ def render_rays(
 ) -> Rendering:
     """Render rays ``(N, 3)``; with a generator, samples are jittered within their intervals.
 
-    ``occupied``: nodes of :meth:`RadianceField.occupied_nodes`; samples nearest to other nodes are taken as empty.
+    ``occupied``: nodes of the field's ``occupied_nodes``; samples nearest to other nodes are taken as empty.
     """
     edges = sampling.edges().expand(len(origins), -1)
     fraction = torch.rand(len(origins), edges.shape[1] - 1, generator=generator) if generator else torch.tensor(0.5)
@@ -105,7 +108,7 @@ def median_distance(rendering: Rendering) -> Tensor:
 
 @torch.no_grad()
 def render_view(
-    field: RadianceField,
+    field: TrainableField,
     cameras: Cameras,
     index: int,
     *,
