@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import signed_distance as sd
-from ..core.frames import RESOLUTION, random_rotations, unit_lattice
+from ..core.frames import RESOLUTION, random_rotations
+from .narrow_band import shell_in_cube
 from .primitives import FAMILIES, Solid, log_uniform
 from .recipe import Recipe
 
@@ -21,7 +22,6 @@ Array = NDArray[Any]
 Occupancy = NDArray[np.bool_]
 Operation = Literal["add", "blend", "cut"]
 
-_LATTICE = unit_lattice().reshape(-1, 3)
 _BALL_RADIUS = float(np.sqrt(3.0) / 2)  # of the cube's circumscribed ball, in edges
 
 
@@ -38,7 +38,8 @@ class Part:
 
     def distance(self, positions: Array) -> Array:
         """Signed distance ``(N,)`` at ``positions (N, 3)`` of the object."""
-        return self.solid((positions - self.center) @ (self.rotation / self.extent)) * self.extent
+        local = (self.rotation.T / self.extent) @ (positions - self.center).T  # axes first: several times as fast
+        return self.solid(local.T) * self.extent
 
 
 @dataclass(frozen=True)
@@ -255,12 +256,8 @@ def sample_cube(rng: np.random.Generator, recipe: Recipe) -> tuple[Occupancy, fl
     center = point + draw_offset(rng, recipe, normal) * edge
     rotation = random_rotations(rng, 1)[0]
     visible = composed.near(center, edge * _BALL_RADIUS)
-    positions = _LATTICE @ (rotation.T * edge) + center
-    distance = visible.distance(positions).reshape((RESOLUTION,) * 3)
-    thickness, solid = rng.uniform(*recipe.shell_thickness), rng.random() < recipe.solid_share
+    thickness, solid = float(rng.uniform(*recipe.shell_thickness)), bool(rng.random() < recipe.solid_share)
     if not visible.parts:
         return np.zeros((RESOLUTION,) * 3, dtype=bool), fraction
-    occupancy = shell_from_distance(distance.astype(np.float32), thickness=float(thickness))
-    if solid:
-        occupancy |= distance < 0
+    occupancy = shell_in_cube(visible.distance, center, rotation, edge, thickness=thickness, solid=solid)
     return random_dilation(rng, occupancy, recipe.max_dilation), fraction

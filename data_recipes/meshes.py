@@ -80,7 +80,8 @@ class Mesh:
 
     def voxelize(self, frame: CubeFrame) -> Occupancy:
         """Exact occupancy ``(32, 32, 32)`` of the surface in a cube."""
-        return cut_cubes(self, [frame])[0]
+        occupancy: Occupancy = cut_cubes(self, [frame])[0]
+        return occupancy
 
 
 def load_mesh(path: str | Path) -> Mesh:

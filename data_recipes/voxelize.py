@@ -56,7 +56,8 @@ def voxelize_triangles(triangles: Array, resolution: int = RESOLUTION) -> Occupa
         ValueError: wrong shape, or values that are not finite.
     """
     triangles = _check(triangles, resolution, "voxelize_triangles")
-    return _voxelize(triangles, np.zeros(len(triangles), dtype=np.intp), 1, resolution)[0]
+    occupancy: Occupancy = _voxelize(triangles, np.zeros(len(triangles), dtype=np.intp), 1, resolution)[0]
+    return occupancy
 
 
 def voxelize_batch(triangles: Array, cubes: Array, count: int, *, resolution: int = RESOLUTION) -> Occupancy:
