@@ -77,6 +77,13 @@ def _sha256(path: Path) -> str:
     return digest.hexdigest()
 
 
+def _save(path: Path, array: NDArray[Any]) -> None:
+    """As ``np.save``, whose error on a full disk does not say that the disk is full."""
+    with path.open("wb") as stream:
+        np.lib.format.write_array_header_1_0(stream, np.lib.format.header_data_from_array_1_0(array))
+        stream.write(array.reshape(-1).view(np.uint8))
+
+
 def pack_frame(frame: CubeFrame | None) -> NDArray[np.float64]:
     """A cube as the ``(13,)`` numbers of ``frames``: centre, edge length, rotation row by row; NaN for no frame."""
     if frame is None:
@@ -163,7 +170,7 @@ def write_shard(folder: str | Path, arrays: Mapping[str, NDArray[Any]], provenan
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir(parents=True)
         for name in layout:
-            np.save(partial / f"{name}.npy", np.ascontiguousarray(arrays[name]))
+            _save(partial / f"{name}.npy", np.ascontiguousarray(arrays[name]))
         manifest = {
             "format": FORMAT, "format_version": FORMAT_VERSION, "count": count,
             "sha256": {name: _sha256(partial / f"{name}.npy") for name in layout}, "provenance": dict(provenance),

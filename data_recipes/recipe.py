@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,13 @@ else:
 BUILTIN_FOLDER = Path(__file__).parent
 SOURCES = ("procedural", "meshes")
 SPLITS = ("train", "val", "test")
+
+
+def _nearest(unknown: Iterable[str], known: Iterable[str]) -> str:
+    """`` (did you mean ...?)`` for names that are almost known ones, else nothing."""
+    choices = list(known)
+    near = [match for name in unknown for match in difflib.get_close_matches(name, choices, n=1)]
+    return f" (did you mean {', '.join(near)}?)" if near else ""
 
 
 @dataclass(frozen=True)
@@ -125,7 +133,9 @@ class Recipe:
             raise ValueError(f"Recipe: split must be one of {', '.join(SPLITS)}, got {self.split!r}")
         unknown = [name for name in self.families if name not in FAMILIES]
         if unknown:
-            raise ValueError(f"Recipe: unknown families {unknown}; known: {', '.join(FAMILIES)}")
+            raise ValueError(
+                f"Recipe: unknown families {unknown}{_nearest(unknown, FAMILIES)}; known: {', '.join(FAMILIES)}"
+            )
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able, lists instead of tuples; :func:`recipe_from_mapping` reads it back."""
@@ -141,7 +151,7 @@ def recipe_from_mapping(values: Mapping[str, Any]) -> Recipe:
     defaults = {field.name: field.default for field in fields(Recipe)}
     unknown = sorted(set(values) - set(defaults))
     if unknown:
-        raise ValueError(f"Recipe: unknown keys {unknown}; known: {', '.join(defaults)}")
+        raise ValueError(f"Recipe: unknown keys {unknown}{_nearest(unknown, defaults)}; known: {', '.join(defaults)}")
     converted: dict[str, Any] = {}
     for key, value in values.items():
         wanted = type(defaults[key])
@@ -170,8 +180,10 @@ def load_recipe(path_or_name: str | Path) -> Recipe:
     if str(path_or_name) in builtin_recipes():
         path = BUILTIN_FOLDER / f"{path_or_name}.toml"
     if not path.is_file():
+        names = builtin_recipes()
+        hint = _nearest([str(path_or_name)], names)
         raise FileNotFoundError(
-            f"load_recipe: {path_or_name} is neither a file nor a built-in recipe ({', '.join(builtin_recipes())})"
+            f"load_recipe: {path_or_name} is neither a file nor a built-in recipe{hint} ({', '.join(names)})"
         )
     try:
         values = tomllib.loads(path.read_text(encoding="utf-8"))

@@ -6,7 +6,6 @@ import pytest
 
 from unghost.core.occupancy import FREE_LABEL, IGNORE_LABEL, SURFACE_LABEL
 from unghost.core.shards import ARRAYS, dequantize_signed, read_shard, unpack_labels
-from unghost.data_recipes import curate as module
 from unghost.data_recipes.curate import curate, damage, sample_pair
 from unghost.data_recipes.recipe import Recipe, load_recipe
 
@@ -75,15 +74,14 @@ def test_empty_field_encodes_to_minus_one():
     assert (signed == -1).all()
 
 
-def test_finished_shards_are_skipped_and_missing_ones_made(tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "SHARD_LENGTH", 8)
-    folders = curate(RECIPE, tmp_path, count=20, seed=0)
+def test_finished_shards_are_skipped_and_missing_ones_made(tmp_path):
+    folders = curate(RECIPE, tmp_path, count=20, seed=0, shard_length=8)
     assert [folder.name for folder in folders] == ["shard-00000", "shard-00001", "shard-00002"]
     assert [len(read_shard(folder)) for folder in folders] == [8, 8, 4]
     before = [arrays(folder) for folder in folders]
     stamps = [(folder / "manifest.json").stat().st_mtime_ns for folder in folders]
     shutil.rmtree(folders[1])
-    assert curate(RECIPE, tmp_path, count=20, seed=0) == folders
+    assert curate(RECIPE, tmp_path, count=20, seed=0, shard_length=8) == folders
     for folder, wanted in zip(folders, before):
         for name, array in arrays(folder).items():
             np.testing.assert_array_equal(array, wanted[name])
