@@ -16,6 +16,7 @@ Limits are enforced by the system where it can: time everywhere on POSIX, memory
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import math
 import os
@@ -34,6 +35,7 @@ import numpy as np
 
 from .mesh_files import MOST_TRIANGLES, MeshFile, mesh_suffixes
 from .mesh_reading import Array
+from .repair import RepairOptions
 
 LOADED, EMPTY, REJECTED = "loaded", "empty", "rejected"
 _MOST_RECORD = 1 << 20
@@ -95,17 +97,21 @@ class MeshGuard:
 
     Args:
         root: the folder that no file, and nothing a file refers to, may leave.
-        limits: what one file may cost.
+        limits: what one file may cost, its repair included.
+        repair: how to repair what is loaded; not at all unless given.
 
     Raises:
         NotADirectoryError: no such folder.
     """
 
-    def __init__(self, root: str | Path, *, limits: GuardLimits | None = None) -> None:
+    def __init__(
+        self, root: str | Path, *, limits: GuardLimits | None = None, repair: RepairOptions | None = None
+    ) -> None:
         self.root = Path(root)
         if not self.root.is_dir():
             raise NotADirectoryError(f"MeshGuard: {self.root} is not a folder")
         self.limits = limits or GuardLimits()
+        self.repair = repair
         self.memory_capped: bool | None = None
         self.starts = 0
         self._process: subprocess.Popen[bytes] | None = None
@@ -127,7 +133,7 @@ class MeshGuard:
         for fresh in (False, True):  # a reader that was found dead before it read anything is no fault of the file
             try:
                 self._start()
-                self._send({"path": str(self.root / path), "root": str(self.root), "seconds": self._seconds})
+                self._send(self.root / path)
                 break
             except _ReaderDied:
                 self.close()
@@ -189,8 +195,12 @@ class MeshGuard:
             raise ImportError("MeshGuard: reading meshes needs trimesh: pip install unghost[recipes]")
         self.memory_capped = bool(ready["capped"])
 
-    def _send(self, request: dict[str, Any]) -> None:
+    def _send(self, path: Path) -> None:
         assert self._connection is not None
+        request = {
+            "path": str(path), "root": str(self.root), "seconds": self._seconds,
+            "repair": None if self.repair is None else dataclasses.asdict(self.repair),
+        }  # fmt: skip
         try:
             self._connection.send_bytes(json.dumps(request).encode())
         except OSError:
@@ -246,7 +256,11 @@ def mesh_paths(root: str | Path) -> list[Path]:
 
 
 def read_folder(
-    root: str | Path, paths: Iterable[str | Path] | None = None, *, limits: GuardLimits | None = None
+    root: str | Path,
+    paths: Iterable[str | Path] | None = None,
+    *,
+    limits: GuardLimits | None = None,
+    repair: RepairOptions | None = None,
 ) -> Iterator[MeshOutcome]:
     """Read the mesh files of a folder, one outcome each, whatever they hold.
 
@@ -255,11 +269,12 @@ def read_folder(
         paths: which files, from the folder (a manifest's, say); all of :func:`mesh_paths` unless given. One that is
             not there is rejected like any other.
         limits: what one file may cost.
+        repair: how to repair what is loaded; not at all unless given.
 
     Raises:
         ImportError: trimesh is not installed.
         NotADirectoryError: no such folder.
     """
-    with MeshGuard(root, limits=limits) as guard:
+    with MeshGuard(root, limits=limits, repair=repair) as guard:
         for path in mesh_paths(root) if paths is None else paths:
             yield guard.read(path)

@@ -5,6 +5,7 @@ It answers in JSON and raw numbers, so that nothing of a file is ever unpickled 
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import sys
@@ -15,8 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from .mesh_files import MeshFile, read_mesh_file
+from .mesh_files import MeshFile, normalise, read_mesh_file
 from .mesh_reading import MeshEmpty, MeshRejected
+from .repair import RepairOptions, repair_triangles
 
 _GRACE = 5.0  # seconds after the asker's limit at which an orphan ends itself
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
@@ -69,21 +71,31 @@ def limit_memory(megabytes: int) -> bool:
     return True
 
 
-def answer(path: str, root: str) -> tuple[dict[str, Any], MeshFile | None]:
-    """How reading one file ends: the record to send, and what was read."""
+def repaired(mesh: MeshFile, options: RepairOptions) -> MeshFile:
+    """The mesh with its triangles repaired, and normalised anew."""
+    triangles, center, extent, dropped = normalise(repair_triangles(mesh.triangles, options=options).triangles)
+    return dataclasses.replace(
+        mesh, triangles=triangles, center=mesh.center + mesh.extent * center, extent=mesh.extent * extent,
+        dropped=mesh.dropped + dropped,
+    )  # fmt: skip
+
+
+def answer(path: str, root: str, repair: RepairOptions | None = None) -> tuple[dict[str, Any], MeshFile | None]:
+    """How reading one file, and repairing it if asked, ends: the record to send, and what was read."""
     begun = time.perf_counter()
     mesh, again = None, True
     try:
         mesh = read_mesh_file(path, root=root)
+        mesh = mesh if repair is None else repaired(mesh, repair)
         status, reason = "loaded", ""
     except MeshEmpty as error:
         status, reason = "empty", str(error)
     except (MeshRejected, ImportError, FileNotFoundError) as error:
         status, reason = "rejected", str(error)
     except MemoryError:
-        status, reason, again = "rejected", "it needs more memory than is allowed", False
+        mesh, status, reason, again = None, "rejected", "it needs more memory than is allowed", False
     except Exception as error:  # whatever a reader did not foresee costs the file, never the run
-        status, reason = "rejected", f"{type(error).__name__}: {str(error)[:200]}"
+        mesh, status, reason = None, "rejected", f"{type(error).__name__}: {str(error)[:200]}"
     record: dict[str, Any] = {
         "status": status, "reason": reason, "again": again, "seconds": time.perf_counter() - begun,
     }  # fmt: skip
@@ -98,8 +110,8 @@ def answer(path: str, root: str) -> tuple[dict[str, Any], MeshFile | None]:
 def main(handle: int, megabytes: int) -> None:
     """Serve requests from the inherited connection ``handle`` until it is closed.
 
-    A request is ``{"path", "root", "seconds"}``; the answer a JSON record, followed by the triangles' bytes
-    (float64, C order) where the file was loaded.
+    A request is ``{"path", "root", "seconds", "repair"}``, the last null or the options' values; the answer is a
+    JSON record, followed by the triangles' bytes (float64, C order) where the file was loaded.
     """
     import signal
 
@@ -121,7 +133,8 @@ def main(handle: int, megabytes: int) -> None:
             return
         fence.root = os.path.realpath(request["root"])
         signal.setitimer(signal.ITIMER_REAL, request["seconds"] + _GRACE)  # its default is to end the process
-        record, mesh = answer(request["path"], request["root"])
+        repair = RepairOptions(**request["repair"]) if request["repair"] is not None else None
+        record, mesh = answer(request["path"], request["root"], repair)
         connection.send_bytes(json.dumps(record).encode())
         if mesh is not None:
             connection.send_bytes(np.ascontiguousarray(mesh.triangles, dtype=np.float64).data.cast("B"))

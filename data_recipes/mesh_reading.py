@@ -101,9 +101,9 @@ def _clip_ears(ring: Array, fan: Array) -> Array:
     """Triangles ``(n - 2, 3, 3)`` of a concave polygon ``(n, 3)``; its fan where no cut is right (it meets itself)."""
     if len(ring) > MOST_CORNERS:
         raise MeshRejected(f"a concave polygon of {len(ring)} corners, more than {MOST_CORNERS}")
-    ring = ring - ring[0]
-    normal = np.cross(ring, np.roll(ring, -1, axis=0)).sum(axis=0)
-    flat = np.delete(ring, int(np.abs(normal).argmax()), axis=1)
+    moved = ring - ring[0]
+    normal = np.cross(moved, np.roll(moved, -1, axis=0)).sum(axis=0)
+    flat = np.delete(moved, int(np.abs(normal).argmax()), axis=1)
     x, y = flat[:, 0], flat[:, 1]
     if (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() < 0:
         flat = flat * [1, -1]
@@ -114,7 +114,7 @@ def _clip_ears(ring: Array, fan: Array) -> Array:
             return fan
         ears.append([left[ear - 1], left[ear], left[(ear + 1) % len(left)]])
         del left[ear]
-    triangles: Array = (ring + fan[0, 0])[np.array([*ears, left])]
+    triangles: Array = ring[np.array([*ears, left])]
     return triangles
 
 
