@@ -33,9 +33,11 @@ def curate(
 
 def harvest(
     out: Path, scenes: int = 16, seed: int = 0, first: int = 0, workers: int = 1, fit: bool = True,
-    cubes: int | None = None,
+    cubes: int | None = None, kinds: tuple[str, ...] = (),
 ) -> None:  # fmt: skip
     """Fit radiance fields to few photos of synthetic scenes; cut out cubes beside the truth.
+
+    Every cube comes with its surroundings, its frame, and how many photos saw each voxel.
 
     Args:
         out: folder for the shards, one a scene; a killed run continues there.
@@ -45,15 +47,29 @@ def harvest(
         workers: processes.
         fit: fit fields; without it, cubes are of perfect fields with synthetic corruption (quick).
         cubes: per scene (and snapshot of its field); the default of HarvestConfig if not given.
+        kinds: of field, NAME or NAME=SHARE: dense, hash, mlp; dense and hash if not given. mlp is meant to be
+            held out: harvest it apart, with another seed, for evaluation.
     """
     from .data_recipes.harvest import HarvestConfig
     from .data_recipes.harvest import harvest as make
 
-    config = HarvestConfig() if cubes is None else HarvestConfig(cubes=cubes)
+    given: dict[str, Any] = {} if cubes is None else {"cubes": cubes}
+    if kinds:
+        given["kinds"], given["shares"] = zip(*map(_named_share, kinds))
+    config = HarvestConfig(**given)
     pairs = make(
         out, scenes=scenes, seed=seed, first=first, workers=workers, config=config, fit=fit, progress=True, log=print
     )
     print(f"{pairs} pairs under {out}")
+
+
+def _named_share(spec: str) -> tuple[str, float]:
+    """``NAME`` or ``NAME=SHARE``."""
+    name, separator, number = spec.partition("=")
+    try:
+        return name, float(number) if separator else 1.0
+    except ValueError:
+        raise ValueError(f"harvest: --kinds must be NAME or NAME=SHARE, the share a number, got {spec!r}") from None
 
 
 def expand_shards(spec: str) -> list[tuple[Path, float]]:
