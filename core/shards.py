@@ -81,7 +81,7 @@ def _save(path: Path, array: NDArray[Any]) -> None:
     """As ``np.save``, whose error on a full disk does not say that the disk is full."""
     with path.open("wb") as stream:
         np.lib.format.write_array_header_1_0(stream, np.lib.format.header_data_from_array_1_0(array))
-        stream.write(array.reshape(-1).view(np.uint8))
+        stream.write(array.reshape(-1).view(np.uint8).data)
 
 
 def pack_frame(frame: CubeFrame | None) -> NDArray[np.float64]:

@@ -132,8 +132,7 @@ def curate(
             raise ValueError(f"curate: {name} must be >= {least}, got {value}")
     if count > MAX_COUNT:
         raise ValueError(f"curate: count must be <= {MAX_COUNT}, got {count}")
-    opened = open_engine(engine, workers)
-    root = checked_root(recipe, mesh_root)
+    opened, root = open_engine(engine, workers), checked_root(recipe, mesh_root)
     plans = _plans(recipe, Path(out), count, seed, root, shard_length)
     found = [plan.finished() for plan in plans]
     todo = [plan for plan, provenance in zip(plans, found) if provenance is None]
@@ -156,9 +155,18 @@ def curate(
                 raise OSError(error.errno, message) from error
             finally:
                 chunks.close()
+                _close_libraries(root)
     if log is not None:
         _report(log, [provenance for provenance in (*found, *made) if provenance is not None])
     return [plan.folder for plan in plans]
+
+
+def _close_libraries(root: str | None) -> None:
+    """End the reader of meshes that one worker, this process, may have used."""
+    if root is not None:
+        from .mesh_sources import close_libraries
+
+        close_libraries()
 
 
 def _report(log: Callable[[str], None], shards: Sequence[dict[str, Any]]) -> None:

@@ -1,6 +1,7 @@
 """Which mesh each sample of a recipe is cut from, and what is known of it: path, hash, licence.
 
-A mesh that cannot be used costs that mesh: the next one in the order takes its samples, and it is reported.
+Meshes are read by :mod:`.guard`, in another process. One that cannot be used costs that mesh: the next one in the
+order takes its samples, and it is reported.
 """
 
 from __future__ import annotations
@@ -9,10 +10,10 @@ import csv
 import hashlib
 import io
 import itertools
+import weakref
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +22,13 @@ from numpy.typing import NDArray
 
 from ..core.frames import CubeFrame
 from .crops import sample_mesh_cubes
-from .meshes import MANIFEST, Mesh, MeshEntry, load_mesh, select_meshes
+from .guard import GuardLimits, MeshGuard
+from .meshes import MANIFEST, Mesh, MeshEntry, select_meshes
 from .recipe import Recipe
 
 MESH_STREAM = 0x6D657368  # keeps the order of meshes apart from the samples' own generators
 CACHED_MESHES = 16
+LIMITS = GuardLimits(wall_seconds=120.0)  # generous: what is rejected must not depend on how busy a machine is
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,9 @@ class MeshLibrary:
         self.sources: dict[int, dict[str, Any]] = {}
         self.rejected: dict[int, dict[str, Any]] = {}
         self._meshes: OrderedDict[int, Mesh] = OrderedDict()
+        self._guard = MeshGuard(self.root, limits=LIMITS)
+        self.close = weakref.finalize(self, self._guard.close)
+        """Ends the reader process; the library is of no use afterwards. Happens by itself when it is dropped."""
 
     def candidates(self, index: int, seed: int) -> Iterator[MeshEntry]:
         """The mesh of sample ``index``, then those that take its place if it is unusable.
@@ -79,16 +85,21 @@ class MeshLibrary:
             self._meshes.move_to_end(entry.row)
             return self._meshes[entry.row]
         path, row = self._relative(entry), self._rows[entry.row]
+        outcome = self._guard.read(path)
         try:
-            digest = hashlib.sha256(entry.path.read_bytes()).hexdigest()
-            if row.get("sha256") not in (None, "", digest):
-                raise ValueError(f"its sha256 is {digest}, {MANIFEST} says {row['sha256']}")
-            mesh = load_mesh(entry.path)
-        except (ValueError, FileNotFoundError) as error:
-            reason = " ".join(str(error).replace(str(entry.path), path).replace(str(self.root), "").split())
+            if outcome.mesh is None:
+                raise ValueError(f"{outcome.status}: {outcome.reason}")
+            if row.get("sha256") not in (None, "", outcome.mesh.sha256):
+                raise ValueError(f"rejected: its sha256 is {outcome.mesh.sha256}, {MANIFEST} says {row['sha256']}")
+            mesh = Mesh.from_triangles(outcome.mesh.triangles)
+        except ValueError as error:
+            reason = " ".join(str(error).replace(str(self.root.resolve()), "").replace(str(self.root), "").split())
             self.rejected[entry.row] = {"path": path, "reason": reason, "row": entry.row}
             return None
-        self.sources[entry.row] = {"path": path, "sha256": digest, "licence": row["licence"], "row": entry.row}
+        known = {"path": path, "sha256": outcome.mesh.sha256, "licence": row["licence"], "row": entry.row}
+        if outcome.mesh.side_files:
+            known["side_files"] = [list(pair) for pair in outcome.mesh.side_files]
+        self.sources[entry.row] = known
         self._meshes[entry.row] = mesh
         if len(self._meshes) > CACHED_MESHES:
             self._meshes.popitem(last=False)
@@ -125,20 +136,29 @@ class MeshLibrary:
         return cubes, {row for _, passed in chosen for row in passed}
 
 
-@lru_cache(maxsize=4)
-def _library(recipe: Recipe, mesh_root: str, stamp: tuple[int, int]) -> MeshLibrary:
-    return MeshLibrary(recipe, mesh_root)
+_opened: dict[tuple[Recipe, str], tuple[tuple[int, int], MeshLibrary]] = {}
 
 
 def open_library(recipe: Recipe, mesh_root: str | Path) -> MeshLibrary:
     """The library of a folder, kept for the next call unless its manifest changes.
 
+    It holds a reader process; :func:`close_libraries` ends it, and so does the end of this process.
+
     Raises:
         FileNotFoundError: no manifest.
         ValueError: a manifest without what it needs, or none of its meshes fits the recipe.
     """
-    try:
-        status = (Path(mesh_root) / MANIFEST).stat()
-    except OSError:
-        return MeshLibrary(recipe, mesh_root)  # which says what is wrong
-    return _library(recipe, str(mesh_root), (status.st_mtime_ns, status.st_size))
+    key = recipe, str(mesh_root)
+    manifest = Path(mesh_root) / MANIFEST
+    status = manifest.stat() if manifest.is_file() else None
+    stamp = (status.st_mtime_ns, status.st_size) if status else (0, 0)
+    if key not in _opened or _opened[key][0] != stamp:
+        _opened[key] = stamp, MeshLibrary(recipe, mesh_root)
+    return _opened[key][1]
+
+
+def close_libraries() -> None:
+    """Forget what :func:`open_library` keeps, and end the reader processes."""
+    for _, library in _opened.values():
+        library.close()
+    _opened.clear()
