@@ -17,6 +17,7 @@ from ..core.frames import RESOLUTION, random_rotations
 from .narrow_band import shell_in_cube
 from .primitives import FAMILIES, Solid, log_uniform
 from .recipe import Recipe
+from .undulations import sine
 
 Array = NDArray[Any]
 Occupancy = NDArray[np.bool_]
@@ -81,7 +82,13 @@ def _bumpy(rng: np.random.Generator, solid: Solid) -> Solid:
     rate, depth = log_uniform(rng, 1.0, 12.0) * 2 * np.pi, log_uniform(rng, 0.004, 0.05)
     phase = rng.uniform(0, 2 * np.pi, size=3)
     bound = 1.0 + depth * rate
-    return lambda p: (solid(p) + depth * np.prod(np.sin(p * rate + phase), axis=-1)) / bound
+
+    def distance(p: Array) -> Array:
+        waves = [sine(p[..., axis] * rate + float(phase[axis])) for axis in range(3)]
+        result: Array = (solid(p) + depth * waves[0] * waves[1] * waves[2]) / bound
+        return result
+
+    return distance
 
 
 def _hollow(rng: np.random.Generator, solid: Solid) -> Solid:
@@ -138,7 +145,7 @@ def compose_object(rng: np.random.Generator, recipe: Recipe) -> ComposedObject:
     return ComposedObject(tuple(parts), float((high - low).max()))
 
 
-def _newton(part: Part, points: Array, steps: int = 6) -> tuple[Array, Array]:
+def _newton(part: Part, points: Array, steps: int = 3) -> tuple[Array, Array]:
     """Points ``(N, 3)`` moved onto a part's own surface, and the distance's gradient there (finite differences)."""
     width = 1e-3 * part.extent
     stencil = np.concatenate([np.zeros((1, 3)), np.eye(3) * width])[:, None, :]
