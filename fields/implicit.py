@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from .radiance import CONTRACTED, contract
+from .radiance import CONTRACTED, Shade, contract
 
 FEATURES = 15  # what the trunk tells the colour head, besides the density
 LOOKS = 48  # nodes along an axis of the grid that knows where the field is empty
@@ -127,17 +127,24 @@ class EncodedField(nn.Module):
 
         Positions that are NaN, or infinite in a contracted field, give NaN. No gradient flows to positions.
         """
-        flat = positions.detach().reshape(-1, 3).float()
-        raw = self.trunk(self.encode(self._local(flat)))[:, :1] + self.start
-        density = nn.functional.softplus(raw) / self.field_pitch
+        return self.query(positions.reshape(-1, 3))[0].reshape(*positions.shape[:-1], 1)
+
+    def query(self, positions: Tensor) -> tuple[Tensor, Shade]:
+        """Density ``(M,)`` at ``positions (M, 3)``, and colours of rows of them: :class:`~.kinds.TrainableField`."""
+        flat = positions.detach().float()
+        known = self.trunk(self.encode(self._local(flat)))
+        density = nn.functional.softplus(known[:, 0] + self.start) / self.field_pitch
         if not self._config.contract:
-            density = density * (flat.abs().amax(dim=-1, keepdim=True) <= 1.0)
-        return density.reshape(*positions.shape[:-1], 1)
+            density = density * (flat.abs().amax(dim=-1) <= 1.0)
+
+        def shade(rows: Tensor, directions: Tensor) -> Tensor:
+            return torch.sigmoid(self.head(torch.cat([known[rows, 1:], directions], dim=1)))
+
+        return density, shade
 
     def color(self, positions: Tensor, directions: Tensor) -> Tensor:
         """RGB in (0, 1) at ``positions (N, 3)`` seen along unit ``directions (N, 3)``: ``(N, 3)``."""
-        features = self.trunk(self.encode(self._local(positions.detach().float())))[:, 1:]
-        return torch.sigmoid(self.head(torch.cat([features, directions], dim=1)))
+        return self.query(positions)[1](torch.arange(len(positions)), directions)
 
     def refine(self, share: float) -> bool:
         """Nothing to do: the resolution is the same from the first step to the last."""

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from .frequency_mlp import FrequencyConfig, FrequencyField
 from .hash_grid import HashConfig, HashField
-from .radiance import RadianceConfig, RadianceField
+from .radiance import RadianceConfig, RadianceField, Shade
 
 
 class TrainableField(Protocol):
@@ -31,6 +31,13 @@ class TrainableField(Protocol):
 
     def color(self, positions: Tensor, directions: Tensor) -> Tensor:
         """RGB in (0, 1) at ``positions (N, 3)`` seen along unit ``directions (N, 3)``: ``(N, 3)``."""
+
+    def query(self, positions: Tensor) -> tuple[Tensor, Shade]:
+        """Density ``(M,)`` at ``positions (M, 3)``, and a function of rows ``(K,)`` of them and directions ``(K, 3)``.
+
+        The function gives their colours ``(K, 3)``. Both as :meth:`density_fn` and :meth:`color` do, but what the
+        two have in common is computed once.
+        """
 
     def parameters(self) -> Iterator[torch.nn.Parameter]:
         """All that is fitted."""

@@ -76,19 +76,22 @@ def render_rays(
     lengths = edges[:, 1:] - edges[:, :-1]
     middles = edges[:, :-1] + fraction * lengths
     positions = origins[:, None] + middles[..., None] * directions[:, None]
+    flat = positions.view(-1, 3)
     if occupied is None:
-        density = field.density_fn(positions)[..., 0]
+        values, shade = field.query(flat)
+        rank, density = torch.arange(len(flat)), values.view(positions.shape[:2])
     else:
-        flat = positions.view(-1, 3)
-        inhabited = occupied[field.nearest_nodes(flat)].nonzero()[:, 0]
-        values = field.density_fn(flat[inhabited])[:, 0]
+        mask = occupied[field.nearest_nodes(flat)]
+        inhabited = mask.nonzero()[:, 0]
+        values, shade = field.query(flat[inhabited])
+        rank = mask.cumsum(0) - 1  # row in what was queried
         density = torch.zeros(len(flat)).index_put((inhabited,), values).view(positions.shape[:2])
     depth = density * lengths
     transmittance = torch.exp(-torch.cumsum(depth, dim=1) + depth)
     weights = transmittance * -torch.expm1(-depth)
     chosen = weights.detach() > sampling.minimal_weight
     ray = chosen.nonzero()[:, 0]
-    color = field.color(positions[chosen], directions[ray])
+    color = shade(rank[chosen.view(-1)], directions[ray])
     rgb = torch.zeros_like(origins).index_add(0, ray, color * weights[chosen][:, None])
     return Rendering(rgb, weights, edges, positions, density)
 
