@@ -134,6 +134,7 @@ class MeshGuard:
             try:
                 self._start()
                 self._send(self.root / path)
+                self._receive(_MOST_RECORD, self._seconds)
                 break
             except _ReaderDied:
                 self.close()

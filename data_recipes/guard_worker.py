@@ -131,6 +131,7 @@ def main(handle: int, megabytes: int) -> None:
             request = json.loads(connection.recv_bytes())
         except EOFError:
             return
+        connection.send_bytes(b"begun")  # from here on, dying is the file's doing
         fence.root = os.path.realpath(request["root"])
         signal.setitimer(signal.ITIMER_REAL, request["seconds"] + _GRACE)  # its default is to end the process
         repair = RepairOptions(**request["repair"]) if request["repair"] is not None else None

@@ -235,13 +235,13 @@ def _contents(path: Path, root: Path) -> bytes:
         handle = os.open(resolved, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     except OSError as error:
         raise MeshRejected(f"cannot be opened ({error.strerror})") from error
+    status = os.fstat(handle)
+    if not stat.S_ISREG(status.st_mode) or status.st_size > MOST_BYTES:
+        os.close(handle)
+        regular = stat.S_ISREG(status.st_mode)
+        raise MeshRejected(f"{status.st_size} bytes, more than {MOST_BYTES}" if regular else "no regular file")
     with os.fdopen(handle, "rb") as stream:
-        status = os.fstat(stream.fileno())
-        if not stat.S_ISREG(status.st_mode):
-            raise MeshRejected("no regular file")
-        if status.st_size > MOST_BYTES:
-            raise MeshRejected(f"{status.st_size} bytes, more than {MOST_BYTES}")
-        data = stream.read(MOST_BYTES + 1)
+        data = stream.read(status.st_size)
     if not data:
         raise MeshRejected("no bytes")
     return data

@@ -71,6 +71,11 @@ def triangulate(vertices: Array, counts: Array, corners: Array) -> Array:
     if corners.min() < 0 or corners.max() >= len(vertices):
         outside = int(((corners < 0) | (corners >= len(vertices))).sum())
         raise MeshRejected(f"{outside} face corners name a vertex that is not among the {len(vertices)}")
+    with np.errstate(invalid="ignore", over="ignore"):  # whether the values are finite is judged after reading
+        return _cut(vertices, counts, corners)
+
+
+def _cut(vertices: Array, counts: Array, corners: Array) -> Array:
     starts = np.cumsum(counts) - counts
     pieces: list[Array] = []
     owners: list[Array] = []
@@ -87,12 +92,11 @@ def triangulate(vertices: Array, counts: Array, corners: Array) -> Array:
 
 def _concave(fans: Array) -> Array:
     """Numbers of the polygons ``(P, n - 2, 3, 3)`` with a fan triangle turned against the whole."""
-    with np.errstate(invalid="ignore", over="ignore"):  # the values are judged after reading
-        fans = fans - fans[:, :1, :1]
-        fans = fans / np.maximum(np.abs(fans).max(axis=(1, 2, 3), keepdims=True), 1e-300)
-        normals = np.cross(fans[:, :, 1] - fans[:, :, 0], fans[:, :, 2] - fans[:, :, 0])
-        whole = normals.sum(axis=1, keepdims=True)
-        turned = (normals * whole).sum(axis=2) < -1e-9 * (whole**2).sum(axis=2)
+    fans = fans - fans[:, :1, :1]
+    fans = fans / np.maximum(np.abs(fans).max(axis=(1, 2, 3), keepdims=True), 1e-300)
+    normals = np.cross(fans[:, :, 1] - fans[:, :, 0], fans[:, :, 2] - fans[:, :, 0])
+    whole = normals.sum(axis=1, keepdims=True)
+    turned = (normals * whole).sum(axis=2) < -1e-9 * (whole**2).sum(axis=2)
     rows: Array = np.flatnonzero(turned.any(axis=1))
     return rows
 
@@ -176,5 +180,6 @@ def _place(vertices: Array, faces: Array, matrix: Array, node: str) -> Array:
         raise MeshRejected(f"the transform of node {node[:80]!r} flattens its mesh (singular values {sizes})")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise MeshRejected(f"faces of node {node[:80]!r} name vertices that are not among its {len(vertices)}")
-    placed: Array = (vertices @ matrix[:3, :3].T + matrix[:3, 3])[faces]
+    with np.errstate(invalid="ignore", over="ignore"):
+        placed: Array = (vertices @ matrix[:3, :3].T + matrix[:3, 3])[faces]
     return placed

@@ -139,6 +139,8 @@ def repair_triangles(triangles: Array, *, options: RepairOptions | None = None) 
     meshes = pymeshlab.MeshSet(verbose=False)
     meshes.add_mesh(pymeshlab.Mesh((vertices - middle) / extent, faces.astype(np.int32)))
     for name, arguments in _steps(options, pymeshlab):
+        if meshes.current_mesh().face_number() == 0:
+            break
         try:
             meshes.apply_filter(name, **arguments)
         except pymeshlab.PyMeshLabException as error:
@@ -165,7 +167,7 @@ def _steps(options: RepairOptions, pymeshlab: Any) -> list[tuple[str, dict[str, 
     if options.orient:
         steps.append(("meshing_re_orient_faces_coherently", {}))
     if options.largest_hole:
-        steps.append(("meshing_close_holes", {"maxholesize": options.largest_hole, "newfaceselected": False}))
+        steps.append(("meshing_close_holes", {"maxholesize": options.largest_hole + 1, "newfaceselected": False}))
     if options.remesh_edge:
         steps.append(
             (
@@ -212,8 +214,8 @@ def fill_solid(triangles: Array, frame: CubeFrame, surface: Occupancy, *, rule: 
     A voxel off the surface is inside where the winding number is not 0, so the overlap of closed parts is inside,
     a part within a part is solid, and one turned inwards is a cavity. Voxels that face each other and are both off
     the surface lie on the same side of it: one point decides for a whole connected region. The rule
-    ``"signed_distance"`` asks open3d at every voxel instead; it counts crossings, so that what two parts share
-    counts as outside.
+    ``"signed_distance"`` asks open3d at every voxel instead; it counts the crossings of a ray, so that what two
+    parts share counts as outside, and a ray that meets an edge exactly can miscount.
 
     Args:
         triangles: ``(F, 3, 3)`` of the whole mesh, in the frame's world.
