@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from ..core.shards import read_shard, write_shard
 from .engines import WorkerDied, open_engine, spans
-from .pairs import Arrays, Chunk, Notes, SampleError, checked_root, damage, make_chunk, sample_pair
+from .pairs import Arrays, Chunk, Notes, SampleError, checked_root, close_meshes, damage, make_chunk, sample_pair
 from .recipe import Recipe
 
 __all__ = ["SampleError", "curate", "damage", "sample_pair"]
@@ -52,8 +52,9 @@ class _Plan:
             chunk = next(chunks)
             length = len(chunk.arrays["inputs"])
             for name, part in chunk.arrays.items():
-                whole = arrays.setdefault(name, np.empty((count, *part.shape[1:]), part.dtype))
-                whole[filled : filled + length] = part
+                if name not in arrays:
+                    arrays[name] = np.empty((count, *part.shape[1:]), part.dtype)
+                arrays[name][filled : filled + length] = part
             sources |= chunk.sources
             rejected |= chunk.rejected
             filled += length
@@ -141,8 +142,7 @@ def curate(
     tasks = ((recipe, seed, root, *span) for plan in todo for span in spans(plan.start, plan.stop, length))
     made: list[dict[str, Any]] = []
     if todo:
-        bar = tqdm(total=count, initial=count - left, unit="cube", disable=not progress, smoothing=0.05)
-        with opened, bar:
+        with opened, tqdm(total=count, initial=count - left, unit="cube", disable=not progress, smoothing=0.05) as bar:
             chunks = opened.ordered(make_chunk, tasks)
             try:
                 for plan in todo:
@@ -155,18 +155,10 @@ def curate(
                 raise OSError(error.errno, message) from error
             finally:
                 chunks.close()
-                _close_libraries(root)
+                close_meshes(root)
     if log is not None:
         _report(log, [provenance for provenance in (*found, *made) if provenance is not None])
     return [plan.folder for plan in plans]
-
-
-def _close_libraries(root: str | None) -> None:
-    """End the reader of meshes that one worker, this process, may have used."""
-    if root is not None:
-        from .mesh_sources import close_libraries
-
-        close_libraries()
 
 
 def _report(log: Callable[[str], None], shards: Sequence[dict[str, Any]]) -> None:

@@ -25,6 +25,7 @@ from .crops import sample_mesh_cubes
 from .guard import GuardLimits, MeshGuard
 from .meshes import MANIFEST, Mesh, MeshEntry, select_meshes
 from .recipe import Recipe
+from .repair import RepairOptions
 
 MESH_STREAM = 0x6D657368  # keeps the order of meshes apart from the samples' own generators
 CACHED_MESHES = 16
@@ -59,7 +60,8 @@ class MeshLibrary:
         self.sources: dict[int, dict[str, Any]] = {}
         self.rejected: dict[int, dict[str, Any]] = {}
         self._meshes: OrderedDict[int, Mesh] = OrderedDict()
-        self._guard = MeshGuard(self.root, limits=LIMITS)
+        repair = RepairOptions(remesh_edge=recipe.remesh_edge) if recipe.repair else None
+        self._guard = MeshGuard(self.root, limits=LIMITS, repair=repair)
         self.close = weakref.finalize(self, self._guard.close)
         """Ends the reader process; the library is of no use afterwards. Happens by itself when it is dropped."""
 

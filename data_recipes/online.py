@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..core.shards import dequantize_signed, unpack_labels
 from .engines import LocalEngine, spans
-from .pairs import Chunk, checked_root, make_chunk
+from .pairs import Chunk, checked_root, close_meshes, make_chunk
 from .recipe import Recipe
 
 
@@ -113,9 +113,12 @@ class OnlinePairs:
             LocalEngine(self.workers, ahead=self.workers + ahead) as engine,
             closing(engine.ordered(make_chunk, tasks)) as chunks,
         ):
-            for chunk in chunks:
-                yield _batch(chunk, first)
-                first += batch_size
+            try:
+                for chunk in chunks:
+                    yield _batch(chunk, first)
+                    first += batch_size
+            finally:
+                close_meshes(self._root)
 
 
 def _check(step: int, batch_size: int) -> None:

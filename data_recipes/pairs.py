@@ -174,3 +174,11 @@ def make_chunk(recipe: Recipe, seed: int, mesh_root: str | None, start: int, sto
     library = open_library(recipe, str(mesh_root))
     used = sorted(set(arrays["group"].tolist()))
     return Chunk(arrays, {row: library.sources[row] for row in used}, {row: library.rejected[row] for row in passed})
+
+
+def close_meshes(root: str | None) -> None:
+    """End the reader of meshes that one worker, this process, may have used."""
+    if root is not None:
+        from .mesh_sources import close_libraries
+
+        close_libraries()

@@ -64,6 +64,10 @@ class Recipe:
         formats: mesh file endings, those that need no further reader (``dae`` needs pycollada).
         split: the split of the mesh manifest.
         cubes_per_mesh: consecutive samples that share a mesh (so that a worker loads few).
+        repair: meshes are repaired before they are cut (``repair.RepairOptions``): small holes closed, faces turned
+            the same way, doubles dropped. Needs pymeshlab.
+        remesh_edge: with ``repair``, they are also remeshed to edges of this length, their longest side being 1; 0
+            keeps their triangles.
     """
 
     name: str = "procedural"
@@ -92,6 +96,8 @@ class Recipe:
     formats: tuple[str, ...] = ("glb", "gltf", "obj", "ply", "stl")
     split: str = "train"
     cubes_per_mesh: int = 64
+    repair: bool = False
+    remesh_edge: float = 0.0
 
     def __post_init__(self) -> None:
         self._check_choices()
@@ -118,6 +124,10 @@ class Recipe:
         if not self.severity_exponent > 0 or not 0 <= self.center_jitter <= 0.5:
             raise ValueError("Recipe: severity_exponent must be > 0 and center_jitter in [0, 0.5], "
                              f"got {self.severity_exponent} and {self.center_jitter}")  # fmt: skip
+
+        if not (self.remesh_edge == 0 or (self.repair and 0.001 <= self.remesh_edge <= 0.5)):
+            raise ValueError("Recipe: remesh_edge must be 0, or in [0.001, 0.5] where repair is true, "
+                             f"got {self.remesh_edge} with repair = {str(self.repair).lower()}")  # fmt: skip
 
     def _pair(self, name: str) -> tuple[float, float]:
         value = getattr(self, name)
@@ -158,7 +168,7 @@ def recipe_from_mapping(values: Mapping[str, Any]) -> Recipe:
         given = tuple(value) if isinstance(value, list) else value
         if wanted is float and isinstance(given, int) and not isinstance(given, bool):
             given = float(given)
-        if not isinstance(given, wanted) or isinstance(given, bool):
+        if not isinstance(given, wanted) or isinstance(given, bool) != (wanted is bool):
             raise ValueError(f"Recipe: {key} must be a {wanted.__name__}, got {value!r}")
         converted[key] = given
     return Recipe(**converted)

@@ -53,11 +53,23 @@ def test_unknown_key_is_refused_and_known_ones_are_listed():
         ({"families": ("box", "bunny")}, r"unknown families \['bunny'\]; known: wall"),
         ({"families": ("box", "bal")}, r"unknown families \['bal'\] \(did you mean ball\?\); known: wall"),
         ({"severity_exponent": 0.0}, "severity_exponent"),
+        (
+            {"remesh_edge": 0.02},
+            r"remesh_edge must be 0, or in \[0.001, 0.5\] where repair is true, got 0.02 with .* false",
+        ),
+        ({"repair": True, "remesh_edge": 0.6}, "remesh_edge must be 0, or in"),
     ],
 )
 def test_bad_values_name_the_key(change, message):
     with pytest.raises(ValueError, match=message):
         dataclasses.replace(Recipe(), **change)
+
+
+def test_truth_values_are_read():
+    assert recipe_from_mapping({"repair": True, "remesh_edge": 0.02}).repair is True
+    for wrong in (1, "yes", 0.0):
+        with pytest.raises(ValueError, match="repair must be a bool"):
+            recipe_from_mapping({"repair": wrong})
 
 
 def test_wrong_types_are_refused():
