@@ -5,14 +5,15 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from tyro.conf import Positional, UseAppendAction
+from tyro.conf import Positional, UseAppendAction, arg
 
 
 def curate(
-    recipe: Positional[str], out: Path, count: int = 20_000, seed: int = 0, workers: int = 1,
-    mesh_root: Path | None = None,
+    recipe: Positional[str], out: Path, count: Annotated[int, arg(aliases=["-n", "--n"])] = 20_000, seed: int = 0,
+    workers: int = 1, mesh_root: Path | None = None, engine: Literal["local", "ray"] = "local",
+    shard_length: int = 8192,
 ) -> None:  # fmt: skip
     """Make training pairs from a recipe: procedural cubes or meshes, and their corruptions.
 
@@ -23,11 +24,16 @@ def curate(
         seed: pair i depends on (seed, i) alone.
         workers: processes; the bytes do not depend on it.
         mesh_root: folder with the meshes and their manifest.csv, for recipes that read meshes.
+        engine: where the workers run; ray uses the cluster of RAY_ADDRESS, or else starts one on this machine.
+        shard_length: pairs a shard.
     """
     from .data_recipes.curate import curate as make
     from .data_recipes.recipe import load_recipe
 
-    shards = make(load_recipe(recipe), out, count=count, seed=seed, workers=workers, mesh_root=mesh_root, progress=True)
+    shards = make(
+        load_recipe(recipe), out, count=count, seed=seed, workers=workers, mesh_root=mesh_root, engine=engine,
+        shard_length=shard_length, progress=True, log=print,
+    )  # fmt: skip
     print(f"{count} pairs in {len(shards)} shard{'s' if len(shards) > 1 else ''} under {out}")
 
 
