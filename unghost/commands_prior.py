@@ -78,6 +78,29 @@ def _named_share(spec: str) -> tuple[str, float]:
         raise ValueError(f"harvest: --kinds must be NAME or NAME=SHARE, the share a number, got {spec!r}") from None
 
 
+def preview(
+    folder: Positional[Path], out: Path | None = None, cubes: int = 24, seed: int = 0, against: Path | None = None
+) -> None:
+    """Draw a page of what is in a shard: cubes as surfaces, histograms, statistics, sources and licences.
+
+    Args:
+        folder: a shard, or a folder of shards.
+        out: the page; FOLDER-preview.html beside the folder if not given.
+        cubes: how many to draw.
+        seed: of the choice of cubes.
+        against: another shard or folder; the page states how unlike the two are.
+    """
+    from .data_recipes.preview import write_preview
+
+    page, facts = write_preview(folder, out=out, cubes=cubes, seed=seed, against=against)
+    print(f"{facts['total']} cubes in {facts['shards']} shard{'s' if facts['shards'] > 1 else ''}, "
+          f"IoU of input and truth {facts['iou']['mean']:.3f}; look at {page}")  # fmt: skip
+    if against is not None:
+        found = facts["against"]
+        chance = "" if found["floor"] is None else f" (two halves of one set: {found['floor']:.3f})"
+        print(f"distance to {against}: {found['distance']:.3f}{chance}")
+
+
 def expand_shards(spec: str) -> list[tuple[Path, float]]:
     """``FOLDER`` or ``FOLDER=WEIGHT`` to shards and their weights.
 
