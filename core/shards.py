@@ -98,6 +98,12 @@ def unpack_frame(numbers: NDArray[np.float64]) -> CubeFrame | None:
     return CubeFrame(np.array(numbers[:3]), float(numbers[3]), np.array(numbers[4:]).reshape(3, 3))
 
 
+def stays_within(path: str) -> bool:
+    """Whether a path of a source is relative and stays in its folder, on every system (so no ``\\`` and no ``:``)."""
+    parts = PurePosixPath(path)
+    return not ("\\" in path or ":" in path or parts.is_absolute() or ".." in parts.parts)
+
+
 def _check_frames(frames: NDArray[np.float64], where: str) -> None:
     known = frames[~np.isnan(frames).all(axis=1)]
     rotations = known[:, 4:].reshape(-1, 3, 3)
@@ -121,9 +127,10 @@ def _check_sources(source: NDArray[np.int32], provenance: Mapping[str, Any], whe
             f"{where}: source must lie in [{NO_SOURCE}, {len(sources)}), got {source.min()} to {source.max()}"
         )
     for entry in sources:
-        path = str(entry.get("path", ""))
-        if "\\" in path or ":" in path or PurePosixPath(path).is_absolute() or ".." in PurePosixPath(path).parts:
-            raise ValueError(f"{where}: the path of a source must be relative and stay in its folder, got {path!r}")
+        if not stays_within(str(entry.get("path", ""))):
+            raise ValueError(
+                f"{where}: the path of a source must be relative and stay in its folder, got {entry['path']!r}"
+            )
 
 
 def _check_values(arrays: Mapping[str, NDArray[Any]], provenance: Mapping[str, Any], where: str) -> None:

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.frames import CubeFrame
+from ..core.shards import stays_within
 from .crops import sample_mesh_cubes
 from .guard import GuardLimits, MeshGuard
 from .meshes import MANIFEST, Mesh, MeshEntry, select_meshes
@@ -87,8 +88,10 @@ class MeshLibrary:
             self._meshes.move_to_end(entry.row)
             return self._meshes[entry.row]
         path, row = self._relative(entry), self._rows[entry.row]
-        outcome = self._guard.read(path)
         try:
+            if not stays_within(path):
+                raise ValueError("rejected: its path holds a character that is no part of a name on every system")
+            outcome = self._guard.read(path)
             if outcome.mesh is None:
                 raise ValueError(f"{outcome.status}: {outcome.reason}")
             if row.get("sha256") not in (None, "", outcome.mesh.sha256):

@@ -57,6 +57,11 @@ def _clean_cubes(
     if recipe.source == "procedural":
         drawn = [sample_cube(rng, recipe) for rng in rngs]
         return [CleanCube(rng, *cube, index) for rng, cube, index in zip(rngs, drawn, indices)], set()
+    if recipe.source == "csg":
+        from .csg import csg_cubes_at
+
+        exact = csg_cubes_at(rngs, recipe, indices, seed)
+        return [CleanCube(rng, *cube) for rng, cube in zip(rngs, exact)], set()
     from .mesh_sources import open_library
 
     assert mesh_root is not None
@@ -105,7 +110,7 @@ def sample_pair(
 
     Returns:
         input ``(32, 32, 32)`` float32 signed opacity, labels ``(32, 32, 32)`` uint8 (see :func:`damage`), severity
-        in [0, 1], edge fraction, group (the sample's own index, or its mesh's row in the manifest).
+        in [0, 1], edge fraction, group (the sample's own index, its mesh's row in the manifest, or its tree's number).
     """
     (clean,), _ = _clean_cubes(recipe, [index], seed, checked_root(recipe, mesh_root))
     signed, labels, severity = damage(clean.rng, clean.occupancy, recipe)
@@ -118,7 +123,7 @@ def checked_root(recipe: Recipe, mesh_root: str | Path | None) -> str | None:
     Raises:
         ValueError: one is needed and None was given.
     """
-    if recipe.source == "procedural":
+    if recipe.source != "meshes":
         return None
     if mesh_root is None:
         raise ValueError(f"curate: recipe {recipe.name!r} reads meshes: mesh_root must name their folder, got None")
@@ -167,7 +172,7 @@ def make_chunk(recipe: Recipe, seed: int, mesh_root: str | None, start: int, sto
             raise
         except Exception:  # which of them?
             passed |= {row for i in range(low, high) for row in _named(arrays, start, recipe, i, seed, mesh_root)}
-    if recipe.source == "procedural":
+    if recipe.source != "meshes":
         return Chunk(arrays, {}, {})
     from .mesh_sources import open_library
 

@@ -18,7 +18,7 @@ else:
     import tomli as tomllib
 
 BUILTIN_FOLDER = Path(__file__).parent
-SOURCES = ("procedural", "meshes")
+SOURCES = ("procedural", "meshes", "csg")
 SPLITS = ("train", "val", "test")
 
 
@@ -37,7 +37,8 @@ class Recipe:
 
     Attributes:
         name: shown in provenance.
-        source: ``"procedural"`` or ``"meshes"``.
+        source: ``"procedural"`` (signed distances), ``"meshes"`` (files) or ``"csg"`` (exact solids by boolean
+            trees, see :mod:`.csg`; needs manifold3d).
         edge_fraction: log, edge of a cube over the longest side of its object.
         families: primitive families to draw from; empty means all of them (``primitives.FAMILIES``).
         parts: log, how many solids one object has (rounded).
@@ -51,7 +52,7 @@ class Recipe:
             ``1 - on_share - near_share`` lies 0.5 to 0.85 edges off (near-empty cubes).
         center_jitter: edges.
         empty_share: truly empty cubes.
-        solid_share: the inside is filled (procedural only; meshes need not be closed).
+        solid_share: the inside is filled (procedural and csg only; meshes need not be closed).
         shell_thickness: uniform, 1 marks the voxels that the surface crosses.
         max_dilation: 0 to this many dilations by one voxel, lower counts likelier.
         soft_share: the input is a soft opacity instead of bits.
@@ -63,7 +64,7 @@ class Recipe:
         licences: mesh licences that may be used.
         formats: mesh file endings, those that need no further reader (``dae`` needs pycollada).
         split: the split of the mesh manifest.
-        cubes_per_mesh: consecutive samples that share a mesh (so that a worker loads few).
+        cubes_per_mesh: consecutive samples that share a mesh or boolean tree (so that a worker loads few).
         repair: meshes are repaired before they are cut (``repair.RepairOptions``): small holes closed, faces turned
             the same way, doubles dropped. Needs pymeshlab.
         remesh_edge: with ``repair``, they are also remeshed to edges of this length, their longest side being 1; 0

@@ -5,7 +5,7 @@ import pathlib
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from unghost.core.frames import CubeFrame, random_rotations
@@ -17,6 +17,7 @@ from unghost.core.shards import (
     pack_labels,
     quantize_signed,
     read_shard,
+    stays_within,
     unpack_frame,
     unpack_labels,
     write_shard,
@@ -99,6 +100,7 @@ def test_labels_by_hand():
         pack_labels(labels + 2)
 
 
+@settings(deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_packing_is_inverse(seed):
     labels = np.random.default_rng(seed).integers(0, 3, size=(2, 32, 32, 32), dtype=np.uint8)
@@ -204,6 +206,7 @@ def test_a_frame_by_hand():
     assert unpack_frame(numbers[1]) is None
 
 
+@settings(deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_frames_survive_exactly(seed):
     rng = np.random.default_rng(seed)
@@ -241,6 +244,11 @@ def test_sources_that_are_none_are_refused(tmp_path, provenance, rule):
     with pytest.raises(ValueError, match=rule):
         write_shard(tmp_path / "s", arrays() | {"source": optional()["source"]}, provenance)
     assert not list(tmp_path.iterdir())
+
+
+def test_paths_by_hand():
+    assert all(stays_within(path) for path in ("a.obj", "a/b c.obj", "..a/b", ""))
+    assert not any(stays_within(path) for path in ("/a", "../a", "a/../b", "C:a", "a\\..\\b", "file:///a"))
 
 
 @pytest.mark.parametrize(("missing", "extra"), [("severity", None), (None, "normals")])
@@ -316,6 +324,7 @@ def test_a_full_disk_is_named_and_leaves_nothing(tmp_path, monkeypatch, where):
     read_shard(tmp_path / "s", verify=True)
 
 
+@settings(deadline=None)
 @given(st.integers(0, 5), st.floats(0, 1, exclude_max=True))
 def test_a_shard_cut_anywhere_is_refused(whole, which, share):
     folder, files = whole

@@ -185,6 +185,17 @@ def test_procedural_cubes_have_no_source(tmp_path):
     assert "sources" not in shard.provenance
 
 
+def test_exact_solids_come_by_tree_and_alone_as_together(tmp_path):
+    pytest.importorskip("manifold3d")
+    recipe = dataclasses.replace(load_recipe("csg"), cubes_per_mesh=3)
+    shard = read_shard(curate(recipe, tmp_path, count=8, seed=0)[0], verify=True)
+    assert shard.group.tolist() == [0, 0, 0, 1, 1, 1, 2, 2]
+    for index in (2, 7):
+        signed, labels, _, _, _ = sample_pair(recipe, index, seed=0)
+        np.testing.assert_allclose(dequantize_signed(shard.inputs[index]), signed, atol=1 / 255 + 1e-6)
+        np.testing.assert_array_equal(unpack_labels(np.array(shard.labels[index : index + 1]))[0], labels)
+
+
 def test_a_bad_mesh_costs_that_mesh_and_is_reported(tmp_path, mesh_root):
     for name in ("broken.ply", "changed.ply"):
         shutil.copy(mesh_root / "balls/0.ply", mesh_root / name)
@@ -219,6 +230,16 @@ def test_a_folder_of_bad_meshes_only_ends_with_a_reason(tmp_path, mesh_root):
     ):
         curate(MESH_RECIPE, tmp_path / "out", count=4, seed=0, mesh_root=mesh_root)
     assert not (tmp_path / "out" / "shard-00000").exists()
+
+
+def test_a_mesh_whose_name_no_other_system_has_is_passed_over(tmp_path, mesh_root):
+    shutil.copy(mesh_root / "balls/0.ply", mesh_root / "a:b.ply")
+    add_row(mesh_root, "a:b.ply,train,CC0-1.0")
+    heard = []
+    folders = curate(MESH_RECIPE, tmp_path / "out", count=12, seed=0, mesh_root=mesh_root, log=heard.append)
+    assert heard == ["a:b.ply was passed over: rejected: its path holds a character that is no part of a name on "
+                     "every system"]  # fmt: skip
+    assert set(read_shard(folders[0]).group.tolist()) == {0, 2}
 
 
 def test_an_empty_mesh_folder_is_named(tmp_path):

@@ -6,8 +6,8 @@ from unghost.data_recipes.recipe import Recipe, builtin_recipes, load_recipe, re
 
 
 def test_builtin_recipes_load_under_their_own_names():
-    assert {"procedural", "meshes"} <= set(builtin_recipes())
-    for name in ("procedural", "meshes"):
+    assert {"procedural", "meshes", "csg"} <= set(builtin_recipes())
+    for name in ("procedural", "meshes", "csg"):
         assert load_recipe(name).name == load_recipe(name).source == name
 
 
@@ -48,7 +48,7 @@ def test_unknown_key_is_refused_and_known_ones_are_listed():
         ({"on_share": 0.8, "near_share": 0.3}, "on_share"),
         ({"max_dilation": -1}, "max_dilation must be whole and >= 0"),
         ({"parts": (0, 3)}, "parts must be"),
-        ({"source": "cad"}, "source must be one of procedural, meshes, got 'cad'"),
+        ({"source": "cad"}, "source must be one of procedural, meshes, csg, got 'cad'"),
         ({"split": "all"}, "split must be one of train, val, test"),
         ({"families": ("box", "bunny")}, r"unknown families \['bunny'\]; known: wall"),
         ({"families": ("box", "bal")}, r"unknown families \['bal'\] \(did you mean ball\?\); known: wall"),
