@@ -159,6 +159,14 @@ def test_any_kind_of_field_is_harvested(kind, tmp_path):
     assert shard.surroundings is not None
     assert shard.frames is not None
     assert shard.view_count.max() <= shard.provenance["photos"]
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # as the workers have it
+    try:
+        again = harvest_scene(3, 5, config)[0]
+    finally:
+        torch.set_num_threads(threads)
+    for name, array in again.items():
+        np.testing.assert_array_equal(getattr(shard, name), array, err_msg=name)
 
 
 def test_kinds_come_in_their_shares_in_the_same_rooms():
@@ -180,6 +188,7 @@ def test_a_scene_that_fails_is_told_and_the_run_goes_on(tmp_path, monkeypatch):
         raise FloatingPointError("train_field: the loss is not finite at step 3")
 
     monkeypatch.setattr(training, "train_field", diverge)
+    monkeypatch.setattr(torch, "set_num_threads", lambda count: None)  # this process keeps its own
     index, problem = module._work(str(tmp_path), 3, 5, TINY, True)
     assert (index, problem) == (5, "train_field: the loss is not finite at step 3")
     assert not list(tmp_path.iterdir())

@@ -134,6 +134,18 @@ def test_colour_lies_in_the_unit_range_and_depends_on_place_and_view(kind):
 
 
 @every_kind
+def test_one_query_says_what_density_and_colour_say(kind):
+    field = random_start(kind)
+    positions = torch.rand(30, 3, generator=torch.Generator().manual_seed(6)) * 2.4 - 1.2
+    rows = torch.tensor([29, 0, 7, 7])
+    directions = torch.nn.functional.normalize(torch.randn(4, 3, generator=torch.Generator().manual_seed(7)), dim=1)
+    density, shade = field.query(positions)
+    torch.testing.assert_close(density, field.density_fn(positions)[:, 0])
+    torch.testing.assert_close(shade(rows, directions), field.color(positions[rows], directions))
+    assert shade(rows[:0], directions[:0]).shape == (0, 3)
+
+
+@every_kind
 def test_every_parameter_is_fitted_once_and_has_a_gradient(kind):
     field = random_start(kind)
     grouped = [parameter for parameters, _ in field.parameter_groups() for parameter in parameters]
