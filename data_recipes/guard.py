@@ -9,8 +9,9 @@ has died, hung or run out of memory. A bad file costs itself:
     for outcome in read_folder("meshes"):        # goes on after every bad file
         ...
 
-Limits are enforced by the system where it can: time everywhere on POSIX, memory on Linux
-(``MeshGuard.memory_capped`` says so).
+Limits are enforced by the system where it can: time on every POSIX system, memory on Linux
+(``MeshGuard.memory_capped`` says so). The first limit of time counts computing only, so that a busy machine reads
+the same files as an idle one.
 """
 
 from __future__ import annotations
@@ -50,7 +51,8 @@ class GuardLimits:
     """What one file may cost.
 
     Attributes:
-        wall_seconds: reading it, > 0.
+        cpu_seconds: computing, > 0; how busy the machine is does not change which files are read.
+        wall_seconds: in all, > 0; for a reader that waits instead of computing.
         memory_megabytes: by which the reader may grow, at least 64.
         startup_seconds: starting the reader, which is no fault of the file.
 
@@ -58,12 +60,13 @@ class GuardLimits:
         ValueError: a limit outside its range.
     """
 
-    wall_seconds: float = 30.0
+    cpu_seconds: float = 30.0
+    wall_seconds: float = 240.0
     memory_megabytes: int = 2048
-    startup_seconds: float = 120.0
+    startup_seconds: float = 600.0
 
     def __post_init__(self) -> None:
-        for name, least in (("wall_seconds", 0.0), ("startup_seconds", 0.0), ("memory_megabytes", 63)):
+        for name, least in (("cpu_seconds", 0), ("wall_seconds", 0), ("startup_seconds", 0), ("memory_megabytes", 63)):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > least):
                 raise ValueError(f"GuardLimits: {name} must be finite and > {least}, got {value}")
@@ -78,7 +81,7 @@ class MeshOutcome:
         status: ``"loaded"``, ``"empty"`` (sound, without a triangle) or ``"rejected"``.
         reason: why it was not loaded; empty where it was.
         mesh: what was read, where it was loaded.
-        seconds: from asking to having the answer, a restart of the reader included.
+        seconds: from asking to having the answer; starting the reader does not count.
     """
 
     path: Path
@@ -129,12 +132,12 @@ class MeshGuard:
             ImportError: trimesh is not installed.
             RuntimeError: the reader process cannot be started.
         """
-        begun = time.perf_counter()
         for fresh in (False, True):  # a reader that was found dead before it read anything is no fault of the file
             try:
                 self._start()
                 self._send(self.root / path)
-                self._receive(_MOST_RECORD, self._seconds)
+                self._receive(_MOST_RECORD, self.limits.startup_seconds)
+                begun = time.perf_counter()
                 break
             except _ReaderDied:
                 self.close()
@@ -199,7 +202,7 @@ class MeshGuard:
     def _send(self, path: Path) -> None:
         assert self._connection is not None
         request = {
-            "path": str(path), "root": str(self.root), "seconds": self._seconds,
+            "path": str(path), "root": str(self.root), "seconds": self._seconds, "cpu": self.limits.cpu_seconds,
             "repair": None if self.repair is None else dataclasses.asdict(self.repair),
         }  # fmt: skip
         try:
@@ -218,7 +221,7 @@ class MeshGuard:
         except (EOFError, OSError):
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(1.0)
-            raise _ReaderDied(f"the reader died of it ({_death(self._process.poll())})") from None
+            raise _ReaderDied(_death(self._process.poll(), self.limits)) from None
 
     def _mesh(self, record: dict[str, Any]) -> MeshFile:
         """The mesh that follows a record; what does not add up counts as a reader gone wrong."""
@@ -238,10 +241,14 @@ class MeshGuard:
         return MeshFile(triangles, center, extent, dropped, str(record["sha256"]), sides)
 
 
-def _death(code: int | None) -> str:
-    if code is not None and code < 0:
-        return signal.Signals(-code).name if -code in {s.value for s in signal.Signals} else f"signal {-code}"
-    return "no word" if code is None else f"exit status {code}"
+def _death(code: int | None, limits: GuardLimits) -> str:
+    """What an exit status says of a reader's end."""
+    if code == -signal.SIGPROF:  # of the clock that the worker sets itself
+        return f"it computed for longer than {limits.cpu_seconds:g} s"
+    if code is None or code >= 0:
+        return f"the reader died of it ({'no word' if code is None else f'exit status {code}'})"
+    name = signal.Signals(-code).name if -code in {s.value for s in signal.Signals} else f"signal {-code}"
+    return f"the reader died of it ({name})"
 
 
 def mesh_paths(root: str | Path) -> list[Path]:

@@ -110,8 +110,8 @@ def answer(path: str, root: str, repair: RepairOptions | None = None) -> tuple[d
 def main(handle: int, megabytes: int) -> None:
     """Serve requests from the inherited connection ``handle`` until it is closed.
 
-    A request is ``{"path", "root", "seconds", "repair"}``, the last null or the options' values; the answer is a
-    JSON record, followed by the triangles' bytes (float64, C order) where the file was loaded.
+    A request is ``{"path", "root", "seconds", "cpu", "repair"}``, the last null or the options' values; the answer
+    is ``begun``, then a JSON record, followed by the triangles' bytes (float64, C order) where the file was loaded.
     """
     import signal
 
@@ -133,10 +133,12 @@ def main(handle: int, megabytes: int) -> None:
             return
         connection.send_bytes(b"begun")  # from here on, dying is the file's doing
         fence.root = os.path.realpath(request["root"])
-        signal.setitimer(signal.ITIMER_REAL, request["seconds"] + _GRACE)  # its default is to end the process
+        signal.setitimer(signal.ITIMER_PROF, request["cpu"])  # what these clocks send ends the process by default
+        signal.setitimer(signal.ITIMER_REAL, request["seconds"] + _GRACE)
         repair = RepairOptions(**request["repair"]) if request["repair"] is not None else None
         record, mesh = answer(request["path"], request["root"], repair)
         connection.send_bytes(json.dumps(record).encode())
         if mesh is not None:
             connection.send_bytes(np.ascontiguousarray(mesh.triangles, dtype=np.float64).data.cast("B"))
+        signal.setitimer(signal.ITIMER_PROF, 0)
         signal.setitimer(signal.ITIMER_REAL, 0)
