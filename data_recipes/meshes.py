@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from ..core.frames import CubeFrame
 from .box_tree import BoxTree
 from .crops import cut_cubes, sample_mesh_cubes
+from .mesh_files import load_mesh as load_mesh
 from .recipe import Recipe
 
 Array = NDArray[Any]
@@ -82,36 +83,6 @@ class Mesh:
         """Exact occupancy ``(32, 32, 32)`` of the surface in a cube."""
         occupancy: Occupancy = cut_cubes(self, [frame])[0]
         return occupancy
-
-
-def load_mesh(path: str | Path) -> Mesh:
-    """Read any format that trimesh reads, with the transforms of scene nodes applied, normalised to longest side 1.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ImportError: trimesh is not installed.
-        ValueError: not readable as a mesh, without triangles, or with corners that are not finite.
-    """
-    source = Path(path)
-    if not source.is_file():
-        raise FileNotFoundError(f"load_mesh: {source} is not a file")
-    try:
-        import trimesh
-    except ImportError as error:
-        raise ImportError("load_mesh: reading meshes needs trimesh: pip install unghost[recipes]") from error
-    try:
-        scene = trimesh.load_scene(source, process=False, skip_materials=True)
-        soup = [
-            trimesh.transform_points(np.asarray(geometry.vertices), scene.graph.get(node)[0])[geometry.faces]
-            for node in scene.graph.nodes_geometry
-            if isinstance(geometry := scene.geometry[scene.graph[node][1]], trimesh.Trimesh)
-        ]
-    except Exception as error:  # readers of a dozen formats raise whatever they like
-        raise ValueError(f"load_mesh: cannot read {source} ({type(error).__name__}: {error})") from error
-    try:
-        return Mesh.from_triangles(np.concatenate(soup) if soup else np.zeros((0, 3, 3)))
-    except ValueError as error:
-        raise ValueError(f"load_mesh: {source}: {error}") from None
 
 
 @dataclass(frozen=True)
