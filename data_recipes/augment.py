@@ -206,7 +206,7 @@ def doubled_surface(rng: np.random.Generator, occupancy: Occupancy, severity: fl
     """A second copy of patches of the surface, 2 to 8 voxels off, as wrong depths or poses leave it."""
     budget, resolution = _budget(rng, occupancy, severity), occupancy.shape[0]
     direction = rng.normal(size=3)
-    shift = np.rint(direction / np.linalg.norm(direction) * rng.uniform(2.0, min(8.5, resolution / 2)))
+    shift = np.rint(direction / np.linalg.norm(direction) * rng.uniform(2.0, max(2.0, min(8.5, resolution / 2))))
     score = coarse_noise(rng, int(rng.integers(2, 7)), resolution)
     score = score + np.float32(rng.uniform(0, 0.5)) * coarse_noise(rng, int(rng.integers(8, 20)), resolution)
     return _flip(occupancy, np.where(_shifted(occupancy, shift) & ~occupancy, score, _NEVER), budget)

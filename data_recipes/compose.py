@@ -13,15 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import signed_distance as sd
-from ..core.frames import RESOLUTION, random_rotations, unit_lattice
+from ..core.frames import RESOLUTION, random_rotations
+from .narrow_band import shell_in_cube
 from .primitives import FAMILIES, Solid, log_uniform
 from .recipe import Recipe
+from .undulations import sine
 
 Array = NDArray[Any]
 Occupancy = NDArray[np.bool_]
 Operation = Literal["add", "blend", "cut"]
 
-_LATTICE = unit_lattice().reshape(-1, 3)
 _BALL_RADIUS = float(np.sqrt(3.0) / 2)  # of the cube's circumscribed ball, in edges
 
 
@@ -38,7 +39,8 @@ class Part:
 
     def distance(self, positions: Array) -> Array:
         """Signed distance ``(N,)`` at ``positions (N, 3)`` of the object."""
-        return self.solid((positions - self.center) @ (self.rotation / self.extent)) * self.extent
+        local = (self.rotation.T / self.extent) @ (positions - self.center).T  # axes first: several times as fast
+        return self.solid(local.T) * self.extent
 
 
 @dataclass(frozen=True)
@@ -80,7 +82,13 @@ def _bumpy(rng: np.random.Generator, solid: Solid) -> Solid:
     rate, depth = log_uniform(rng, 1.0, 12.0) * 2 * np.pi, log_uniform(rng, 0.004, 0.05)
     phase = rng.uniform(0, 2 * np.pi, size=3)
     bound = 1.0 + depth * rate
-    return lambda p: (solid(p) + depth * np.prod(np.sin(p * rate + phase), axis=-1)) / bound
+
+    def distance(p: Array) -> Array:
+        waves = [sine(p[..., axis] * rate + float(phase[axis])) for axis in range(3)]
+        result: Array = (solid(p) + depth * waves[0] * waves[1] * waves[2]) / bound
+        return result
+
+    return distance
 
 
 def _hollow(rng: np.random.Generator, solid: Solid) -> Solid:
@@ -137,7 +145,7 @@ def compose_object(rng: np.random.Generator, recipe: Recipe) -> ComposedObject:
     return ComposedObject(tuple(parts), float((high - low).max()))
 
 
-def _newton(part: Part, points: Array, steps: int = 6) -> tuple[Array, Array]:
+def _newton(part: Part, points: Array, steps: int = 3) -> tuple[Array, Array]:
     """Points ``(N, 3)`` moved onto a part's own surface, and the distance's gradient there (finite differences)."""
     width = 1e-3 * part.extent
     stencil = np.concatenate([np.zeros((1, 3)), np.eye(3) * width])[:, None, :]
@@ -255,12 +263,8 @@ def sample_cube(rng: np.random.Generator, recipe: Recipe) -> tuple[Occupancy, fl
     center = point + draw_offset(rng, recipe, normal) * edge
     rotation = random_rotations(rng, 1)[0]
     visible = composed.near(center, edge * _BALL_RADIUS)
-    positions = _LATTICE @ (rotation.T * edge) + center
-    distance = visible.distance(positions).reshape((RESOLUTION,) * 3)
-    thickness, solid = rng.uniform(*recipe.shell_thickness), rng.random() < recipe.solid_share
+    thickness, solid = float(rng.uniform(*recipe.shell_thickness)), bool(rng.random() < recipe.solid_share)
     if not visible.parts:
         return np.zeros((RESOLUTION,) * 3, dtype=bool), fraction
-    occupancy = shell_from_distance(distance.astype(np.float32), thickness=float(thickness))
-    if solid:
-        occupancy |= distance < 0
+    occupancy = shell_in_cube(visible.distance, center, rotation, edge, thickness=thickness, solid=solid)
     return random_dilation(rng, occupancy, recipe.max_dilation), fraction

@@ -1,13 +1,8 @@
 """Harvested pairs: cubes of badly constrained fields, beside the truth of the scenes they were fitted to.
 
-A radiance field is fitted to a few photos of a synthetic scene; cubes of its opacity are inputs, the
-scene's signed distance gives three-valued labels:
-
-    surface  within three quarters of a field cell of a surface that some training photo sees, and what is
-             opaque up to four cells behind such a surface: a field spreads a surface over several of its cells,
-             and what lies behind the front is part of what makes it opaque
-    free     more than one and a half cells outside every solid: whatever is opaque there is a ghost
-    ignore   the rest of solids and walls, surfaces that no photo sees, the band between, outside the box
+A radiance field of one of several kinds is fitted to a few photos of a synthetic scene, and not for long; cubes
+of its opacity are inputs, the scene's signed distance gives three-valued labels (see :mod:`.harvest_labels`).
+Each is stored with its surroundings, its frame, and how many photos saw each voxel (:mod:`.harvest_context`).
 """
 
 from __future__ import annotations
@@ -25,18 +20,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.aabb import contains, scene_extent
+from ..core.aabb import scene_extent
 from ..core.frames import RESOLUTION, CubeFrame, cube_lattices, random_rotations
-from ..core.occupancy import (
-    DEFAULT_OPACITY_THRESHOLD,
-    EMPTY,
-    FREE_LABEL,
-    IGNORE_LABEL,
-    SURFACE_LABEL,
-    opacity_from_density,
-    opacity_from_signed,
-    signed_from_opacity,
-)
+from ..core.occupancy import DEFAULT_OPACITY_THRESHOLD, opacity_from_density, opacity_from_signed
 from ..core.shards import (
     dequantize_signed,
     pack_labels,
@@ -45,13 +31,17 @@ from ..core.shards import (
     unpack_labels,
     write_shard,
 )
+from .harvest_context import count_views, signed_opacity, surroundings
+from .harvest_labels import Truth, check_fit, severity_of
 
 if TYPE_CHECKING:
-    from ..fields.radiance import RadianceField
+    from ..fields.kinds import TrainableField
     from ..fields.scenes import PhotographedScene
 
-SURFACE_BAND, FREE_BAND, BEHIND_BAND = 0.75, 1.5, 4.0  # in field cells
+KINDS = ("dense", "hash", "mlp")  # of field, as fields.kinds has them
+HELD_OUT_KINDS = ("mlp",)  # never in a harvest for training
 EARLY = 0.45  # share of the fit at which the first cubes are taken
+TOGETHER, QUERY = 8, 1 << 17  # cubes, and points in them, that are worked on at a time
 
 
 @dataclass(frozen=True)
@@ -59,7 +49,9 @@ class HarvestConfig:
     """What a harvest varies, each value drawn per scene.
 
     Attributes:
-        resolutions: density nodes along an axis of the contracted cube.
+        kinds, shares: kinds of field, and how often each is drawn (relative to their sum). A frequency-encoded
+            ``mlp`` is left out by default: it is there to be harvested for evaluation.
+        resolutions: cells along an axis of the contracted cube (of the finest level, of half the shortest wavelength).
         photos, photo_width: how many photos a field sees, and their width in pixels (4:3).
         steps: fitting steps, log-uniform; cubes are also taken after ``EARLY`` of them.
         rays: rays a step.
@@ -71,6 +63,8 @@ class HarvestConfig:
             opaque, or a larger share of what is opaque are ghosts.
     """
 
+    kinds: tuple[str, ...] = ("dense", "hash")
+    shares: tuple[float, ...] = (0.5, 0.5)
     resolutions: tuple[int, ...] = (64, 80, 96, 112, 128, 160)
     photos: tuple[int, int] = (12, 32)
     photo_width: tuple[int, int] = (80, 128)
@@ -84,6 +78,13 @@ class HarvestConfig:
     most_ghosts: float = 0.9
 
     def __post_init__(self) -> None:
+        unknown = sorted(set(self.kinds) - set(KINDS))
+        if unknown or not self.kinds or len(set(self.kinds)) < len(self.kinds):
+            raise ValueError(f"HarvestConfig: kinds must be different ones of {', '.join(KINDS)}, got {self.kinds}")
+        if len(self.shares) != len(self.kinds) or not all(0 < share < np.inf for share in self.shares):
+            raise ValueError(
+                f"HarvestConfig: shares must be one finite number > 0 for each of {self.kinds}, got {self.shares}"
+            )
         for name in ("photos", "photo_width", "steps", "voxel_pitch", "room_pitch"):
             low, high = getattr(self, name)
             if not 0 < low <= high:
@@ -92,87 +93,23 @@ class HarvestConfig:
             raise ValueError(f"HarvestConfig: rays and cubes must be >= 1, got {self.rays} and {self.cubes}")
 
 
-class Truth:
-    """The labels of a photographed scene; a coarse grid of exact distances settles most points.
-
-    A signed distance changes by no more than one goes, so that a node far from any surface speaks for its cell.
-    """
-
-    def __init__(self, photographed: PhotographedScene, aabb: NDArray[np.float64], *, nodes: int = 64) -> None:
-        self.photographed, self.aabb = photographed, aabb
-        axes = [np.linspace(aabb[0, axis], aabb[1, axis], nodes) for axis in range(3)]
-        self._coarse = photographed.scene.signed_distance(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1))
-        self._cell = (aabb[1] - aabb[0]) / (nodes - 1)
-
-    def distances(self, points: NDArray[np.float64], margin: float | NDArray[np.float64]) -> NDArray[np.float64]:
-        """Signed distance of ``points (N, 3)``: exact where it is at most ``margin``, else some value beyond it.
-
-        ``margin`` is one number or one for each point ``(N,)``.
-        """
-        index = np.rint((points - self.aabb[0]) / self._cell).astype(np.int64)
-        index = np.clip(index, 0, np.array(self._coarse.shape) - 1)
-        distance: NDArray[np.float64] = self._coarse[index[:, 0], index[:, 1], index[:, 2]]
-        slack = np.linalg.norm(points - (self.aabb[0] + index * self._cell), axis=1)
-        close = np.flatnonzero(np.abs(distance) - slack <= margin)
-        distance[close] = self.photographed.scene.signed_distance(points[close])
-        return distance
-
-    def labels(
-        self, positions: NDArray[np.float64], field_pitch: float, opaque: NDArray[np.bool_]
-    ) -> NDArray[np.uint8]:
-        """Three-valued labels ``(...)`` of world ``positions (..., 3)``, ``opaque (...)`` in the field or not."""
-        labels = np.full(positions.shape[:-1], IGNORE_LABEL, dtype=np.uint8)
-        inside = contains(self.aabb, positions)
-        flat = positions[inside]
-        distance = self.distances(flat, np.where(opaque[inside], BEHIND_BAND, FREE_BAND) * field_pitch)
-        found = np.full(len(flat), IGNORE_LABEL, dtype=np.uint8)
-        found[distance > FREE_BAND * field_pitch] = FREE_LABEL
-        near = np.abs(distance) <= SURFACE_BAND * field_pitch
-        behind = opaque[inside] & (distance < 0) & (distance >= -BEHIND_BAND * field_pitch) & ~near
-        for band, reach in ((near, 2.0), (behind, 2.0 + BEHIND_BAND)):
-            chosen = np.flatnonzero(band)
-            found[chosen[self._seen(flat[chosen], reach * field_pitch)]] = SURFACE_LABEL
-        labels[inside] = found
-        return labels
-
-    def _seen(self, points: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
-        """Whether some photo shows ``points (N, 3)``, or a surface at most ``reach`` in front of them."""
-        relaxed = self.photographed.depth_maps + reach
-        seen: NDArray[np.bool_] = (
-            self.photographed.true_cameras.view_count(points, depth_maps=relaxed, tolerance=0.02) > 0
-        )
-        return seen
-
-
-def severity_of(inputs: NDArray[np.float32], labels: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """One minus the IoU of opaque input and surface label over voxels that count: ``(N,)`` in [0, 1]."""
-    valid = labels != IGNORE_LABEL
-    opaque = (opacity_from_signed(inputs) > DEFAULT_OPACITY_THRESHOLD) & valid
-    surface = labels == SURFACE_LABEL
-    union = (opaque | surface).sum(axis=(1, 2, 3))
-    both = (opaque & surface).sum(axis=(1, 2, 3))
-    return (1.0 - np.where(union > 0, both / np.maximum(union, 1), 1.0)).astype(np.float32)
-
-
-def check_fit(inputs: NDArray[np.float32], labels: NDArray[np.uint8], config: HarvestConfig) -> None:
-    """Raise RuntimeError if a field's cubes (both ``(N, R, R, R)``) hold too little surface, or too many ghosts."""
-    opaque = opacity_from_signed(inputs) > DEFAULT_OPACITY_THRESHOLD
-    surface = labels == SURFACE_LABEL
-    true, ghosts = int((opaque & surface).sum()), int((opaque & (labels == FREE_LABEL)).sum())
-    if true < config.fewest_opaque * surface.sum():
-        raise RuntimeError(f"failed fit: {true / surface.sum():.0%} of the surface is opaque")
-    if ghosts > config.most_ghosts * (true + ghosts):
-        raise RuntimeError(f"failed fit: {ghosts / (true + ghosts):.0%} of what is opaque are ghosts")
-
-
-def _propose(rng: np.random.Generator, field: RadianceField, count: int) -> NDArray[np.float64]:
-    """Cube centres ``(count, 3)`` in the field's box: nine in ten where it is opaque, the rest anywhere."""
+def _density_fn(field: TrainableField) -> Callable[[NDArray[Any]], NDArray[np.float32]]:
+    """The field for numpy arrays ``(M, 3)`` float32 to ``(M,)``, without gradients."""
     import torch
 
-    aabb = field.aabb
-    candidates = rng.uniform(aabb[0], aabb[1], size=(60_000, 3))
-    with torch.no_grad():
-        density = field.density_fn(torch.from_numpy(candidates).float()).numpy()[:, 0]
+    def density_fn(positions: NDArray[Any]) -> NDArray[np.float32]:
+        with torch.no_grad():
+            parts = [field.density_fn(part)[:, 0] for part in torch.split(torch.from_numpy(positions), QUERY)]
+        density: NDArray[np.float32] = torch.cat(parts).numpy()
+        return density
+
+    return density_fn
+
+
+def _propose(rng: np.random.Generator, field: TrainableField, count: int) -> NDArray[np.float64]:
+    """Cube centres ``(count, 3)`` in the field's box: nine in ten where it is opaque, the rest anywhere."""
+    candidates = rng.uniform(field.aabb[0], field.aabb[1], size=(60_000, 3))
+    density = _density_fn(field)(candidates.astype(np.float32))
     opacity = opacity_from_density(density, field.field_pitch)
     weight = np.where(opacity > DEFAULT_OPACITY_THRESHOLD, 1.0, 0.02 * opacity) + 1e-6
     chosen = rng.choice(len(candidates), size=count, p=weight / weight.sum())
@@ -182,49 +119,70 @@ def _propose(rng: np.random.Generator, field: RadianceField, count: int) -> NDAr
 
 
 def harvest_cubes(
-    rng: np.random.Generator, field: RadianceField, truth: Truth, config: HarvestConfig
+    rng: np.random.Generator, field: TrainableField, truth: Truth, config: HarvestConfig
 ) -> dict[str, NDArray[Any]]:
     """Cut ``config.cubes`` cubes out of a fitted field and label them: a shard's arrays, less ``group``."""
-    import torch
-
     count = config.cubes
     centers = _propose(rng, field, count)
     low, high = np.log(config.voxel_pitch)
-    pitches = field.field_pitch * np.exp(rng.uniform(low, high, size=count))
-    edges = pitches * RESOLUTION
+    edges = field.field_pitch * np.exp(rng.uniform(low, high, size=count)) * RESOLUTION
     rotations = random_rotations(rng, count)
     rotations[rng.random(count) >= config.rotated_share] = np.eye(3)
-    lattice = cube_lattices(centers, edges, rotations)
-    with torch.no_grad():
-        density = field.density_fn(torch.from_numpy(lattice).float()).numpy()[..., 0]
-    assumed_pitch = field.field_pitch * np.exp(rng.uniform(-0.3, 0.3, size=(count, 1, 1, 1)))
-    inputs = signed_from_opacity(opacity_from_density(density, assumed_pitch)).astype(np.float32)
-    inputs[~contains(field.aabb, lattice)] = EMPTY
-    opaque = opacity_from_signed(inputs) > DEFAULT_OPACITY_THRESHOLD
-    labels = truth.labels(lattice, field.field_pitch, opaque)
-    return {
-        "inputs": quantize_signed(inputs),
-        "labels": pack_labels(labels),
-        "severity": severity_of(inputs, labels),
-        "edge_fraction": (edges / scene_extent(field.aabb)).astype(np.float32),
-    }
+    assumed_pitch = field.field_pitch * np.exp(rng.uniform(-0.3, 0.3, size=count))
+    density_fn = _density_fn(field)
+    parts: list[dict[str, NDArray[Any]]] = []
+    for start in range(0, count, TOGETHER):
+        some = slice(start, start + TOGETHER)
+        frames = (centers[some], edges[some], rotations[some])
+        lattice = cube_lattices(*frames)
+        inputs = signed_opacity(density_fn, lattice, assumed_pitch[some], field.aabb)
+        opaque = opacity_from_signed(inputs) > DEFAULT_OPACITY_THRESHOLD
+        labels = truth.labels(lattice, field.field_pitch, opaque)
+        about = surroundings(density_fn, *frames, assumed_pitch[some], field.aabb)
+        parts.append({
+            "inputs": quantize_signed(inputs),
+            "labels": pack_labels(labels),
+            "severity": severity_of(inputs, labels),
+            "surroundings": quantize_signed(about),
+            "view_count": count_views(truth.photographed.cameras, *frames),
+        })  # fmt: skip
+    arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    arrays["edge_fraction"] = (edges / scene_extent(field.aabb)).astype(np.float32)
+    arrays["frames"] = np.concatenate([centers, edges[:, None], rotations.reshape(count, 9)], axis=1)
+    return arrays
+
+
+def _photograph(rng: np.random.Generator, config: HarvestConfig) -> PhotographedScene:
+    from ..fields.scenes import photograph, random_scene
+
+    width = int(rng.integers(config.photo_width[0], config.photo_width[1] + 1))
+    photos = int(rng.integers(config.photos[0], config.photos[1] + 1))
+    return photograph(rng, random_scene(rng), count=photos, width=width, height=width * 3 // 4)
+
+
+def _draw_field(rng: np.random.Generator, config: HarvestConfig) -> tuple[str, int, TrainableField]:
+    """A fresh field: its kind, its resolution, and itself."""
+    from ..fields.kinds import make_field
+
+    shares = np.array(config.shares) / np.sum(config.shares)
+    kind = config.kinds[int(rng.choice(len(config.kinds), p=shares))]
+    resolution = int(rng.choice(config.resolutions))
+    opacity = float(np.exp(rng.uniform(np.log(0.002), np.log(0.03))))
+    return kind, resolution, make_field(kind, resolution, initial_opacity=opacity, seed=int(rng.integers(2**31)))
 
 
 def harvest_scene(seed: int, index: int, config: HarvestConfig) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """Build, photograph, fit and cut scene ``index``: shard arrays and provenance. Depends on (seed, index) alone."""
-    from ..fields.radiance import RadianceConfig, RadianceField
+    """Build, photograph, fit and cut scene ``index``: shard arrays and provenance. Depends on (seed, index) alone.
+
+    Scene ``index`` is the same room in the same photos whatever the kinds: a set that is held out needs its own seed.
+    """
     from ..fields.rendering import Sampling
-    from ..fields.scenes import photograph, random_scene
     from ..fields.training import TrainingConfig, train_field
 
     rng = np.random.default_rng([seed, index])
-    width = int(rng.integers(config.photo_width[0], config.photo_width[1] + 1))
-    photos = int(rng.integers(config.photos[0], config.photos[1] + 1))
-    photographed = photograph(rng, random_scene(rng), count=photos, width=width, height=width * 3 // 4)
-    resolution = int(rng.choice(config.resolutions))
+    photographed = _photograph(rng, config)
+    kind, resolution, field = _draw_field(rng, config)
     steps = int(np.exp(rng.uniform(*np.log(config.steps))))
-    opacity = float(np.exp(rng.uniform(np.log(0.002), np.log(0.03))))
-    field = RadianceField(RadianceConfig(resolution, max(48, resolution * 3 // 4), opacity))
     samples = max(48, round(2.4 / field.field_pitch))
     fitting = TrainingConfig(
         rays=config.rays,
@@ -234,7 +192,7 @@ def harvest_scene(seed: int, index: int, config: HarvestConfig) -> tuple[dict[st
     truth = Truth(photographed, field.aabb)
     parts: list[dict[str, NDArray[Any]]] = []
 
-    def snapshot(fitted: RadianceField, step: int) -> None:
+    def snapshot(fitted: TrainableField, step: int) -> None:
         if step == round(EARLY * steps):
             parts.append(harvest_cubes(rng, fitted, truth, config))
 
@@ -244,11 +202,15 @@ def harvest_scene(seed: int, index: int, config: HarvestConfig) -> tuple[dict[st
     parts.append(harvest_cubes(rng, field, truth, config))
     arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     arrays["group"] = np.full(len(arrays["inputs"]), index, dtype=np.int32)
-    check_fit(dequantize_signed(arrays["inputs"]), unpack_labels(arrays["labels"]), config)
+    check_fit(
+        dequantize_signed(arrays["inputs"]), unpack_labels(arrays["labels"]),
+        fewest_opaque=config.fewest_opaque, most_ghosts=config.most_ghosts,
+    )  # fmt: skip
+    photos, _, width, _ = photographed.images.shape
     provenance = {
         "recipe": "harvest", "seed": seed, "scene": index, "photos": photos, "photo_width": width, "steps": steps,
-        "field": "dense grid", "resolution": resolution, "psnr": round(float(report["psnr"]), 3),
-        "config": dataclasses.asdict(config), "licence": "generated",
+        "field": kind, "resolution": resolution, "field_pitch": field.field_pitch,
+        "psnr": round(float(report["psnr"]), 3), "config": dataclasses.asdict(config), "licence": "generated",
     }  # fmt: skip
     return arrays, provenance
 
@@ -284,6 +246,7 @@ def room_scene(seed: int, index: int, config: HarvestConfig) -> tuple[dict[str, 
         "labels": pack_labels(np.stack([labels for _, labels, _ in pairs])),
         "severity": np.array([severity for _, _, severity in pairs], dtype=np.float32),
         "edge_fraction": (edges / scene_extent(aabb)).astype(np.float32),
+        "frames": np.concatenate([centers, edges[:, None], rotations.reshape(count, 9)], axis=1),
         "group": np.full(count, index, dtype=np.int32),
     }
     provenance: dict[str, Any] = {"recipe": "rooms", "seed": seed, "scene": index, "config": dataclasses.asdict(config)}
@@ -297,7 +260,7 @@ def _work(folder: str, seed: int, index: int, config: HarvestConfig, fit: bool) 
 
             torch.set_num_threads(1)
         arrays, provenance = (harvest_scene if fit else room_scene)(seed, index, config)
-    except RuntimeError as error:  # a scene without a free path, a failed fit; reported, not fatal
+    except (RuntimeError, FloatingPointError) as error:  # no free path, a failed fit: reported, not fatal
         return index, str(error)
     write_shard(Path(folder) / f"scene-{index:05d}", arrays, provenance)
     return index, ""

@@ -6,6 +6,8 @@ Mesh files need ``trimesh`` (``pip install unghost[recipes]``); everything after
 from __future__ import annotations
 
 import csv
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -14,11 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.frames import CubeFrame, random_rotations
-from .compose import draw_offset, random_dilation
-from .primitives import log_uniform
+from ..core.frames import CubeFrame
+from .box_tree import BoxTree
+from .crops import cut_cubes, sample_mesh_cubes
+from .mesh_files import load_mesh as load_mesh
 from .recipe import Recipe
-from .voxelize import voxelize_triangles
 
 Array = NDArray[Any]
 Occupancy = NDArray[np.bool_]
@@ -34,15 +36,15 @@ class Mesh:
 
     Attributes:
         triangles: ``(F, 3, 3)``, none without area.
-        centroids: ``(F, 3)``.
-        reaches: ``(F,)``, the distance from a triangle's centroid to its furthest corner.
+        normals: ``(F, 3)``, of length 1.
         cumulative_areas: ``(F,)``, ends at 1.
+        tree: finds the triangles near a cube.
     """
 
     triangles: Array
-    centroids: Array
-    reaches: Array
+    normals: Array
     cumulative_areas: Array
+    tree: BoxTree
 
     @classmethod
     def from_triangles(cls, triangles: Array) -> Mesh:
@@ -61,59 +63,26 @@ class Mesh:
         if not (np.isfinite(extent) and extent > 0):
             raise ValueError(f"Mesh: the longest side must be finite and > 0, got {extent} from {len(soup)} triangles")
         soup = (soup - (low + high) / 2) / extent
-        areas = np.linalg.norm(np.cross(soup[:, 1] - soup[:, 0], soup[:, 2] - soup[:, 0]), axis=1) / 2
+        normals = np.cross(soup[:, 1] - soup[:, 0], soup[:, 2] - soup[:, 0])
+        areas = np.linalg.norm(normals, axis=1) / 2
         kept = areas > 1e-14
         if not kept.any():
             raise ValueError(f"Mesh: at least one triangle must have an area, got {len(soup)} without")
-        soup, areas = soup[kept], areas[kept]
-        centroids = soup.mean(axis=1)
-        reaches = np.linalg.norm(soup - centroids[:, None], axis=2).max(axis=1)
-        return cls(soup, centroids, reaches, np.cumsum(areas) / areas.sum())
+        soup, areas, normals = soup[kept], areas[kept], normals[kept]
+        normals /= 2 * areas[:, None]
+        return cls(soup, normals, np.cumsum(areas) / areas.sum(), BoxTree.build(soup))
 
     def surface_point(self, rng: np.random.Generator) -> tuple[Array, Array]:
         """A point uniform in area and the unit normal of its triangle, both ``(3,)``."""
         row = min(int(np.searchsorted(self.cumulative_areas, rng.random(), side="right")), len(self.triangles) - 1)
         a, b, c = self.triangles[row]
         root, along = np.sqrt(rng.random()), rng.random()
-        normal = np.cross(b - a, c - a)
-        return (1 - root) * a + root * (1 - along) * b + root * along * c, normal / np.linalg.norm(normal)
+        return (1 - root) * a + root * (1 - along) * b + root * along * c, self.normals[row]
 
     def voxelize(self, frame: CubeFrame) -> Occupancy:
         """Exact occupancy ``(32, 32, 32)`` of the surface in a cube."""
-        reach = self.reaches + frame.edge_length * np.sqrt(3.0) / 2
-        offsets = self.centroids - frame.center
-        near = np.einsum("fi,fi->f", offsets, offsets) <= reach**2
-        return voxelize_triangles(frame.to_local(self.triangles[near]))
-
-
-def load_mesh(path: str | Path) -> Mesh:
-    """Read any format that trimesh reads, with the transforms of scene nodes applied, normalised to longest side 1.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ImportError: trimesh is not installed.
-        ValueError: not readable as a mesh, without triangles, or with corners that are not finite.
-    """
-    source = Path(path)
-    if not source.is_file():
-        raise FileNotFoundError(f"load_mesh: {source} is not a file")
-    try:
-        import trimesh
-    except ImportError as error:
-        raise ImportError("load_mesh: reading meshes needs trimesh: pip install unghost[recipes]") from error
-    try:
-        scene = trimesh.load_scene(source, process=False, skip_materials=True)
-        soup = [
-            trimesh.transform_points(np.asarray(geometry.vertices), scene.graph.get(node)[0])[geometry.faces]
-            for node in scene.graph.nodes_geometry
-            if isinstance(geometry := scene.geometry[scene.graph[node][1]], trimesh.Trimesh)
-        ]
-    except Exception as error:  # readers of a dozen formats raise whatever they like
-        raise ValueError(f"load_mesh: cannot read {source} ({type(error).__name__}: {error})") from error
-    try:
-        return Mesh.from_triangles(np.concatenate(soup) if soup else np.zeros((0, 3, 3)))
-    except ValueError as error:
-        raise ValueError(f"load_mesh: {source}: {error}") from None
+        occupancy: Occupancy = cut_cubes(self, [frame])[0]
+        return occupancy
 
 
 @dataclass(frozen=True)
@@ -160,24 +129,14 @@ def select_meshes(recipe: Recipe, mesh_root: str | Path) -> list[MeshEntry]:
 
 
 def sample_mesh_cube(rng: np.random.Generator, mesh: Mesh, recipe: Recipe) -> tuple[Occupancy, CubeFrame, float]:
-    """One clean cube of a mesh.
-
-    The centre is a point uniform in area, moved as the recipe says (on, near, away); the rotation is uniform on
-    SO(3); the edge log-uniform. Empty cubes lie beside the mesh.
+    """One clean cube of a mesh, see :func:`crops.sample_mesh_cubes`.
 
     Returns:
-        ``occupancy (32, 32, 32)`` bool, dilated 0 to ``recipe.max_dilation`` times; the cube in the mesh's
-        (normalised) coordinates; its edge over the mesh's longest side.
+        ``occupancy (32, 32, 32)`` bool; the cube in the mesh's (normalised) coordinates; its edge over the
+        mesh's longest side.
     """
-    fraction = log_uniform(rng, *recipe.edge_fraction)
-    empty = rng.random() < recipe.empty_share
-    point, normal = mesh.surface_point(rng)
-    center = point + draw_offset(rng, recipe, normal) * fraction
-    rotation = random_rotations(rng, 1)[0]
-    if empty:
-        center = center + rotation[:, 0] * (1.8 + fraction)  # longer than the diagonal of the mesh's box
-    frame = CubeFrame(center, fraction, rotation)
-    return random_dilation(rng, mesh.voxelize(frame), recipe.max_dilation), frame, fraction
+    occupancy, (frame,) = sample_mesh_cubes([rng], mesh, recipe)
+    return occupancy[0], frame, frame.edge_length
 
 
 @lru_cache(maxsize=8)
@@ -190,6 +149,14 @@ def _cached_mesh(path: Path) -> Mesh:
     return load_mesh(path)
 
 
+def _entry_at(recipe: Recipe, mesh_root: str, index: int, seed: int) -> MeshEntry:
+    """The mesh of a sample: runs of ``cubes_per_mesh`` share one, in an order shuffled anew each time round."""
+    entries = _cached_selection(recipe, mesh_root)
+    turn, place = divmod(index // recipe.cubes_per_mesh, len(entries))
+    order = np.random.default_rng([seed, turn, _MESH_STREAM]).permutation(len(entries))
+    return entries[int(order[place])]
+
+
 def mesh_cube_at(
     rng: np.random.Generator, recipe: Recipe, mesh_root: str, index: int, seed: int
 ) -> tuple[Occupancy, float, int]:
@@ -198,9 +165,19 @@ def mesh_cube_at(
     ``recipe.cubes_per_mesh`` consecutive samples share a mesh; the meshes come in an order shuffled anew each
     time all have been used.
     """
-    entries = _cached_selection(recipe, mesh_root)
-    turn, place = divmod(index // recipe.cubes_per_mesh, len(entries))
-    order = np.random.default_rng([seed, turn, _MESH_STREAM]).permutation(len(entries))
-    entry = entries[int(order[place])]
-    occupancy, _, fraction = sample_mesh_cube(rng, _cached_mesh(entry.path), recipe)
-    return occupancy, fraction, entry.row
+    return mesh_cubes_at([rng], recipe, mesh_root, [index], seed)[0]
+
+
+def mesh_cubes_at(
+    rngs: Sequence[np.random.Generator], recipe: Recipe, mesh_root: str, indices: Sequence[int], seed: int
+) -> list[tuple[Occupancy, float, int]]:
+    """:func:`mesh_cube_at` for several samples, each with its own generator; those of one mesh are cut together."""
+    found: list[tuple[Occupancy, float, int]] = []
+    entries = [_entry_at(recipe, mesh_root, index, seed) for index in indices]
+    start = 0
+    for entry, group in itertools.groupby(entries):
+        stop = start + len(list(group))
+        occupancy, frames = sample_mesh_cubes(rngs[start:stop], _cached_mesh(entry.path), recipe)
+        found += [(cube, frame.edge_length, entry.row) for cube, frame in zip(occupancy, frames)]
+        start = stop
+    return found

@@ -1,39 +1,38 @@
 """Families of solids with random proportions, each about one unit long, as signed distances.
 
 A family is ``(rng) -> solid`` and a solid maps ``positions (N, 3)`` to signed distances ``(N,)``
-(negative inside). Magnitudes never exceed the true distance by more than a few percent (the twisted,
-bumpy and periodic solids are divided by a Lipschitz bound), so that a solid which is far from a cube
-can be left out. Every free proportion is log-uniform over the range written beside it.
+(negative inside). Those of this file are exact Euclidean distances, inside and outside, but for ``cable``,
+``lathe`` and ``studs``, which are exact outside and a bound inside; those of :mod:`undulations` are bounds.
+No value exceeds the true distance by more than a few percent, so that a solid which is far from a cube can be
+left out. Every proportion and every count is log-uniform over the range written beside it; what has no
+natural zero (angles of placement, phases, offsets) is uniform.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core import signed_distance as sd
+from . import distances
+from .draws import Array, Family, Solid, log_uniform, log_whole
+from .undulations import leaf, rock, sponge, superquadric, terrain, twisted_bar
 
-Array = NDArray[Any]
-Solid = Callable[[Array], Array]
-Family = Callable[[np.random.Generator], Solid]
-
-
-def log_uniform(rng: np.random.Generator, low: float, high: float, count: int | None = None) -> Any:
-    """Log-uniform draws on [low, high], ``low > 0``; a float, or ``(count,)``."""
-    draws = np.exp(rng.uniform(np.log(low), np.log(high), size=count))
-    return float(draws) if count is None else draws
+__all__ = ["BOUNDS", "FAMILIES", "Family", "Solid", "log_uniform"]
 
 
 def wall(rng: np.random.Generator) -> Solid:
-    """One to three half-spaces meeting: a floor, an edge or a corner, convex or concave."""
-    count = int(rng.integers(1, 4))
-    normals = np.eye(3)[:count] + rng.normal(scale=rng.choice([0.0, 0.15]), size=(count, 3))
+    """One to three half-spaces at right angles: a floor, an edge or a corner, convex or concave."""
+    count = log_whole(rng, 1, 3)
     offsets = rng.uniform(-0.2, 0.2, size=count)
-    combine = sd.union if rng.random() < 0.5 else sd.intersection
-    return lambda p: combine([sd.half_space(p, n, float(o)) for n, o in zip(normals, offsets)])
+    side = 1.0 if rng.random() < 0.5 else -1.0
+    return lambda p: side * distances.corner([side * (p[..., axis] - float(o)) for axis, o in enumerate(offsets)])
+
+
+def wedge(rng: np.random.Generator) -> Solid:
+    """Two half-spaces at an angle of 15 to 165 degrees, the angle solid or hollow."""
+    angle = np.radians(log_uniform(rng, 15.0, 165.0))
+    side = 1.0 if rng.random() < 0.5 else -1.0
+    return lambda p: side * distances.wedge(p[..., 0], p[..., 1], angle)
 
 
 def ball(rng: np.random.Generator) -> Solid:
@@ -45,7 +44,7 @@ def ball(rng: np.random.Generator) -> Solid:
 def ellipsoid(rng: np.random.Generator) -> Solid:
     """Ellipsoid, radii 0.125 to 0.5."""
     radii = log_uniform(rng, 0.125, 0.5, 3)
-    return lambda p: sd.ellipsoid(p, radii)
+    return lambda p: distances.ellipsoid(p, radii)
 
 
 def box(rng: np.random.Generator) -> Solid:
@@ -108,93 +107,61 @@ def torus(rng: np.random.Generator) -> Solid:
 
 def cable(rng: np.random.Generator) -> Solid:
     """Tube swept along a random walk of 3 to 6 points, radius 0.008 to 0.08."""
-    steps = rng.normal(size=(int(rng.integers(3, 7)), 3)) * 0.25
+    steps = rng.normal(size=(log_whole(rng, 3, 6), 3)) * 0.25
     points = np.cumsum(steps + steps[0], axis=0)
     points -= points.mean(axis=0)
     points /= max(2.0 * float(np.abs(points).max()), 1e-6)
     radius = log_uniform(rng, 0.008, 0.08)
-    return lambda p: sd.polyline_tube(p, points, radius)
+    return lambda p: distances.polyline([p[..., 0], p[..., 1], p[..., 2]], points) - radius
 
 
-def leaf(rng: np.random.Generator) -> Solid:
-    """Curved thin sheet with an elliptic outline, thickness 0.004 to 0.03."""
-    curvature, thickness = log_uniform(rng, 0.4, 4.0), log_uniform(rng, 0.004, 0.03)
-    outline = log_uniform(rng, 0.15, 0.5, 2)
-    center = np.array([0.0, 0.0, 1.0 / curvature])
-
-    def distance(p: Array) -> Array:
-        sheet = np.abs(sd.sphere(p - center, 1.0 / curvature)) - thickness / 2
-        rim = (np.hypot(p[..., 0] / outline[0], p[..., 1] / outline[1]) - 1.0) * outline.min()
-        result: Array = np.maximum(np.maximum(sheet, rim), p[..., 2] - 1.0 / curvature)
-        return result
-
-    return distance
+def sheet(rng: np.random.Generator) -> Solid:
+    """Bent sheet with rounded rims, bend radius 0.15 to 3, length 0.3 to 1, width 0.1 to 1, thickness 0.004 to 0.03."""
+    radius, length = log_uniform(rng, 0.15, 3.0), log_uniform(rng, 0.3, 1.0)
+    half_width, thickness = log_uniform(rng, 0.05, 0.5), log_uniform(rng, 0.004, 0.03)
+    half_angle = min(length / (2 * radius), 2.8)
+    return lambda p: distances.bent_sheet(p, radius, half_angle, half_width, thickness)
 
 
 def stairs(rng: np.random.Generator) -> Solid:
     """3 to 7 steps along x, rise over run 0.3 to 1.5, half width 0.1 to 0.5."""
-    count, slope, half_width = int(rng.integers(3, 8)), log_uniform(rng, 0.3, 1.5), log_uniform(rng, 0.1, 0.5)
-    run = 1.0 / count
-    heights = (np.arange(count) + 1) * run * slope
-    centers = [np.array([(i + 0.5) * run - 0.5, 0.0, (h - slope) / 2]) for i, h in enumerate(heights)]
-    return lambda p: sd.union([sd.box(p - c, [run / 2, half_width, h / 2]) for c, h in zip(centers, heights)])
+    count, slope, half_width = log_whole(rng, 3, 7), log_uniform(rng, 0.3, 1.5), log_uniform(rng, 0.1, 0.5)
+    across = np.repeat(np.arange(count + 1), 2)[1:-1] / count - 0.5
+    heights = np.repeat(np.arange(1, count + 1), 2) * slope / count - slope / 2
+    profile = np.concatenate([np.stack([across, heights], axis=1), [[0.5, -slope / 2], [-0.5, -slope / 2]]])
+    return lambda p: distances.extrude(distances.polygon(p[..., 0], p[..., 2], profile), p[..., 1], half_width)
 
 
-def _waves(rng: np.random.Generator, low: float, high: float, count: int) -> tuple[Array, Array, Array]:
-    """Random plane waves: wave vectors ``(3, count)`` (radians per unit), phases, amplitudes that add to 1."""
-    frequency = log_uniform(rng, low, high, count) * 2 * np.pi
-    direction = rng.normal(size=(3, count))
-    vectors = direction / np.linalg.norm(direction, axis=0) * frequency
-    amplitude = 1.0 / frequency
-    return vectors, rng.uniform(0, 2 * np.pi, size=count), amplitude / amplitude.sum()
+def ridges(rng: np.random.Generator) -> Solid:
+    """Ground below a jagged height field that runs along y: 4 to 10 points, heights 0.02 to 0.4."""
+    count = log_whole(rng, 4, 10)
+    across = np.sort(rng.uniform(-0.5, 0.5, size=count))
+    across[[0, -1]] = -0.5, 0.5
+    profile = np.concatenate([np.stack([across, log_uniform(rng, 0.02, 0.4, count)], 1), [[0.5, -0.5], [-0.5, -0.5]]])
+    half = log_uniform(rng, 0.1, 0.5)
+    return lambda p: distances.extrude(distances.polygon(p[..., 0], p[..., 2], profile), p[..., 1], half)
 
 
-def terrain(rng: np.random.Generator) -> Solid:
-    """Ground below a height field of 4 plane waves, 0.5 to 8 per unit, relief 0.02 to 0.2."""
-    vectors, phases, amplitudes = _waves(rng, 0.5, 8.0, 4)
-    relief = log_uniform(rng, 0.02, 0.2)
-    slope = relief * float((amplitudes * np.linalg.norm(vectors[:2], axis=0)).sum())
-    bound = float(np.hypot(1.0, slope))
-    return lambda p: (p[..., 2] - relief * (np.sin(p[..., :2] @ vectors[:2] + phases) @ amplitudes)) / bound
+def studs(rng: np.random.Generator) -> Solid:
+    """Ground with bumps, 3 to 9 a side, radius 0.05 to 0.5 of their pitch, sunk by 0.05 to 0.8 of it."""
+    reach = log_whole(rng, 1, 4)
+    pitch = 1.0 / (2 * reach + 1)
+    radius = pitch * log_uniform(rng, 0.05, 0.5)
+    sunk = radius * log_uniform(rng, 0.05, 0.8)
+    return lambda p: distances.studs(p, pitch, radius, sunk, reach)
 
 
-def rock(rng: np.random.Generator) -> Solid:
-    """Ball displaced by 5 plane waves, 0.7 to 5 per unit, by 0.03 to 0.15."""
-    vectors, phases, amplitudes = _waves(rng, 0.7, 5.0, 5)
-    depth, radius = log_uniform(rng, 0.03, 0.15), log_uniform(rng, 0.2, 0.4)
-    bound = 1.0 + depth * float((amplitudes * np.linalg.norm(vectors, axis=0)).sum())
-    return lambda p: (sd.sphere(p, radius) - depth * (np.sin(p @ vectors + phases) @ amplitudes)) / bound
-
-
-def superquadric(rng: np.random.Generator) -> Solid:
-    """``(|x|^e + |y|^e + |z|^e)^(1/e) = 1`` with exponent 1 to 6 and radii 0.15 to 0.5."""
-    exponent, radii = log_uniform(rng, 1.0, 6.0), log_uniform(rng, 0.15, 0.5, 3)
-    steepest = max(1.0, 3.0 ** (1.0 / exponent - 0.5))
-
-    def distance(p: Array) -> Array:
-        norm = ((np.abs(p) / radii) ** exponent).sum(axis=-1) ** (1.0 / exponent)
-        result: Array = (norm - 1.0) * radii.min() / steepest
-        return result
-
-    return distance
-
-
-def _polygon_distance(points: Array, u: Array, v: Array) -> Array:
-    """Signed distance of ``(u, v)`` to a closed polygon ``(n, 2)``; the usual crossing rule for the sign."""
-    nearest: Array = np.full(u.shape, np.inf)
-    inside = np.zeros(u.shape, dtype=bool)
-    for (u0, v0), (u1, v1) in zip(points, np.roll(points, -1, axis=0)):
-        du, dv, pu, pv = u1 - u0, v1 - v0, u - u0, v - v0
-        along = np.clip((pu * du + pv * dv) / max(du * du + dv * dv, 1e-12), 0.0, 1.0)
-        nearest = np.minimum(nearest, (pu - along * du) ** 2 + (pv - along * dv) ** 2)
-        crosses = (v0 > v) != (v1 > v)
-        inside ^= crosses & (pu < du * pv / (dv if dv != 0 else 1.0))
-    return np.where(inside, -1.0, 1.0) * np.sqrt(nearest)
+def lattice(rng: np.random.Generator) -> Solid:
+    """Square bars along three axes, 3 to 9 each way, thickness 0.04 to 0.6 of their pitch: scaffolds, crates, racks."""
+    reach = log_whole(rng, 1, 4)
+    pitch = 0.5 / (reach + 0.3)
+    half_bar = pitch / 2 * log_uniform(rng, 0.04, 0.6)
+    return lambda p: distances.lattice(p, pitch, half_bar, reach)
 
 
 def _star_outline(rng: np.random.Generator) -> Array:
     """A star-shaped polygon ``(n, 2)`` of 3 to 9 corners, radii 0.15 to 0.5; regular or not."""
-    corners = int(rng.integers(3, 10))
+    corners = log_whole(rng, 3, 9)
     angles = np.arange(corners) * 2 * np.pi / corners
     radii: Array = np.full(corners, 0.45)
     if rng.random() < 0.7:
@@ -206,26 +173,20 @@ def _star_outline(rng: np.random.Generator) -> Array:
 def prism(rng: np.random.Generator) -> Solid:
     """Extruded star-shaped polygon, half height 0.01 to 0.5."""
     outline, half = _star_outline(rng), log_uniform(rng, 0.01, 0.5)
-    return lambda p: np.maximum(_polygon_distance(outline, p[..., 0], p[..., 1]), np.abs(p[..., 2]) - half)
+    return lambda p: distances.extrude(distances.polygon(p[..., 0], p[..., 1], outline), p[..., 2], half)
 
 
 def lathe(rng: np.random.Generator) -> Solid:
     """Wall of 0.01 to 0.06 around a profile of 3 to 5 points turned about z: vases, bowls, lamps."""
-    count = int(rng.integers(3, 6))
-    radii, heights = log_uniform(rng, 0.05, 0.45, count), np.sort(rng.uniform(-0.5, 0.5, size=count))
-    thickness = log_uniform(rng, 0.01, 0.06)
-    points = np.stack([radii, np.zeros(count), heights], axis=-1)
-
-    def distance(p: Array) -> Array:
-        radial = np.sqrt(p[..., 0] ** 2 + p[..., 1] ** 2)
-        return sd.polyline_tube(np.stack([radial, np.zeros_like(radial), p[..., 2]], axis=-1), points, thickness / 2)
-
-    return distance
+    count = log_whole(rng, 3, 5)
+    profile = np.stack([log_uniform(rng, 0.05, 0.45, count), np.sort(rng.uniform(-0.5, 0.5, size=count))], axis=-1)
+    half = log_uniform(rng, 0.01, 0.06) / 2
+    return lambda p: distances.polyline([np.sqrt(p[..., 0] ** 2 + p[..., 1] ** 2), p[..., 2]], profile) - half
 
 
 def grating(rng: np.random.Generator) -> Solid:
     """2 to 10 equal bars side by side: fences, blinds, rows of books, keyboards."""
-    count = int(rng.integers(2, 11))
+    count = log_whole(rng, 2, 10)
     pitch = 1.0 / count
     half = np.array([pitch / 2 * log_uniform(rng, 0.1, 0.9), log_uniform(rng, 0.01, 0.5), log_uniform(rng, 0.05, 0.5)])
     round_bars = rng.random() < 0.3
@@ -239,39 +200,12 @@ def grating(rng: np.random.Generator) -> Solid:
     return distance
 
 
-def twisted_bar(rng: np.random.Generator) -> Solid:
-    """Box twisted about z by up to 1.5 turns a unit."""
-    half = np.array([*log_uniform(rng, 0.05, 0.3, 2), 0.5])
-    rate = rng.uniform(-1.5, 1.5) * 2 * np.pi
-    bound = float(np.hypot(1.0, abs(rate) * np.hypot(half[0], half[1]) * 1.3))
-
-    def distance(p: Array) -> Array:
-        cosine, sine = np.cos(rate * p[..., 2]), np.sin(rate * p[..., 2])
-        x, y = p[..., 0], p[..., 1]
-        turned = np.stack([cosine * x + sine * y, -sine * x + cosine * y, p[..., 2]], axis=-1)
-        near = sd.box(turned, half) / bound
-        return np.where(np.hypot(x, y) > 0.6, np.minimum(near, np.hypot(x, y) - 0.45), near)
-
-    return distance
-
-
-def sponge(rng: np.random.Generator) -> Solid:
-    """Gyroid sheet of 1.5 to 6 periods a unit inside a ball: porous things, foliage-like clutter."""
-    rate, thickness = log_uniform(rng, 1.5, 6.0) * 2 * np.pi, log_uniform(rng, 0.1, 1.0)
-
-    def distance(p: Array) -> Array:
-        q = p * rate
-        gyroid = np.einsum("...i,...i->...", np.sin(q), np.cos(np.roll(q, -1, axis=-1)))
-        result: Array = np.maximum((np.abs(gyroid) - thickness) / (rate * 1.8), sd.sphere(p, 0.5))
-        return result
-
-    return distance
-
+BOUNDS: tuple[Family, ...] = (leaf, terrain, rock, superquadric, twisted_bar, sponge)
 
 FAMILIES: dict[str, Family] = {
     family.__name__: family
     for family in (
-        wall, ball, ellipsoid, box, rounded_box, panel, rod, cylinder, tube, capsule, cone, torus, cable, leaf,
-        stairs, terrain, rock, superquadric, prism, lathe, grating, twisted_bar, sponge,
+        wall, wedge, ball, ellipsoid, box, rounded_box, panel, rod, cylinder, tube, capsule, cone, torus, cable, sheet,
+        stairs, ridges, studs, lattice, prism, lathe, grating, *BOUNDS,
     )
 }  # fmt: skip

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -17,8 +18,15 @@ else:
     import tomli as tomllib
 
 BUILTIN_FOLDER = Path(__file__).parent
-SOURCES = ("procedural", "meshes")
+SOURCES = ("procedural", "meshes", "csg")
 SPLITS = ("train", "val", "test")
+
+
+def _nearest(unknown: Iterable[str], known: Iterable[str]) -> str:
+    """`` (did you mean ...?)`` for names that are almost known ones, else nothing."""
+    choices = list(known)
+    near = [match for name in unknown for match in difflib.get_close_matches(name, choices, n=1)]
+    return f" (did you mean {', '.join(near)}?)" if near else ""
 
 
 @dataclass(frozen=True)
@@ -29,7 +37,8 @@ class Recipe:
 
     Attributes:
         name: shown in provenance.
-        source: ``"procedural"`` or ``"meshes"``.
+        source: ``"procedural"`` (signed distances), ``"meshes"`` (files) or ``"csg"`` (exact solids by boolean
+            trees, see :mod:`.csg`; needs manifold3d).
         edge_fraction: log, edge of a cube over the longest side of its object.
         families: primitive families to draw from; empty means all of them (``primitives.FAMILIES``).
         parts: log, how many solids one object has (rounded).
@@ -43,7 +52,7 @@ class Recipe:
             ``1 - on_share - near_share`` lies 0.5 to 0.85 edges off (near-empty cubes).
         center_jitter: edges.
         empty_share: truly empty cubes.
-        solid_share: the inside is filled (procedural only; meshes need not be closed).
+        solid_share: the inside is filled (procedural and csg only; meshes need not be closed).
         shell_thickness: uniform, 1 marks the voxels that the surface crosses.
         max_dilation: 0 to this many dilations by one voxel, lower counts likelier.
         soft_share: the input is a soft opacity instead of bits.
@@ -55,7 +64,11 @@ class Recipe:
         licences: mesh licences that may be used.
         formats: mesh file endings, those that need no further reader (``dae`` needs pycollada).
         split: the split of the mesh manifest.
-        cubes_per_mesh: consecutive samples that share a mesh (so that a worker loads few).
+        cubes_per_mesh: consecutive samples that share a mesh or boolean tree (so that a worker loads few).
+        repair: meshes are repaired before they are cut (``repair.RepairOptions``): small holes closed, faces turned
+            the same way, doubles dropped. Needs pymeshlab.
+        remesh_edge: with ``repair``, they are also remeshed to edges of this length, their longest side being 1; 0
+            keeps their triangles.
     """
 
     name: str = "procedural"
@@ -84,6 +97,8 @@ class Recipe:
     formats: tuple[str, ...] = ("glb", "gltf", "obj", "ply", "stl")
     split: str = "train"
     cubes_per_mesh: int = 64
+    repair: bool = False
+    remesh_edge: float = 0.0
 
     def __post_init__(self) -> None:
         self._check_choices()
@@ -111,6 +126,10 @@ class Recipe:
             raise ValueError("Recipe: severity_exponent must be > 0 and center_jitter in [0, 0.5], "
                              f"got {self.severity_exponent} and {self.center_jitter}")  # fmt: skip
 
+        if not (self.remesh_edge == 0 or (self.repair and 0.001 <= self.remesh_edge <= 0.5)):
+            raise ValueError("Recipe: remesh_edge must be 0, or in [0.001, 0.5] where repair is true, "
+                             f"got {self.remesh_edge} with repair = {str(self.repair).lower()}")  # fmt: skip
+
     def _pair(self, name: str) -> tuple[float, float]:
         value = getattr(self, name)
         numbers = isinstance(value, tuple) and all(isinstance(v, (int, float)) for v in value)
@@ -125,7 +144,9 @@ class Recipe:
             raise ValueError(f"Recipe: split must be one of {', '.join(SPLITS)}, got {self.split!r}")
         unknown = [name for name in self.families if name not in FAMILIES]
         if unknown:
-            raise ValueError(f"Recipe: unknown families {unknown}; known: {', '.join(FAMILIES)}")
+            raise ValueError(
+                f"Recipe: unknown families {unknown}{_nearest(unknown, FAMILIES)}; known: {', '.join(FAMILIES)}"
+            )
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able, lists instead of tuples; :func:`recipe_from_mapping` reads it back."""
@@ -141,14 +162,14 @@ def recipe_from_mapping(values: Mapping[str, Any]) -> Recipe:
     defaults = {field.name: field.default for field in fields(Recipe)}
     unknown = sorted(set(values) - set(defaults))
     if unknown:
-        raise ValueError(f"Recipe: unknown keys {unknown}; known: {', '.join(defaults)}")
+        raise ValueError(f"Recipe: unknown keys {unknown}{_nearest(unknown, defaults)}; known: {', '.join(defaults)}")
     converted: dict[str, Any] = {}
     for key, value in values.items():
         wanted = type(defaults[key])
         given = tuple(value) if isinstance(value, list) else value
         if wanted is float and isinstance(given, int) and not isinstance(given, bool):
             given = float(given)
-        if not isinstance(given, wanted) or isinstance(given, bool):
+        if not isinstance(given, wanted) or isinstance(given, bool) != (wanted is bool):
             raise ValueError(f"Recipe: {key} must be a {wanted.__name__}, got {value!r}")
         converted[key] = given
     return Recipe(**converted)
@@ -170,8 +191,10 @@ def load_recipe(path_or_name: str | Path) -> Recipe:
     if str(path_or_name) in builtin_recipes():
         path = BUILTIN_FOLDER / f"{path_or_name}.toml"
     if not path.is_file():
+        names = builtin_recipes()
+        hint = _nearest([str(path_or_name)], names)
         raise FileNotFoundError(
-            f"load_recipe: {path_or_name} is neither a file nor a built-in recipe ({', '.join(builtin_recipes())})"
+            f"load_recipe: {path_or_name} is neither a file nor a built-in recipe{hint} ({', '.join(names)})"
         )
     try:
         values = tomllib.loads(path.read_text(encoding="utf-8"))

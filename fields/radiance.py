@@ -6,6 +6,7 @@ mip-NeRF 360, with the maximum norm: ``x -> (2 - 1/|x|) x/|x|``.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,7 @@ from .trilinear import trilinear
 
 CONTRACTED = 2.0  # half side of the contracted cube
 SH_COEFFICIENTS = 4  # spherical harmonics of degree 1 per colour channel
+Shade = Callable[[Tensor, Tensor], Tensor]  # rows (K,) and unit directions (K, 3) to RGB (K, 3)
 SH_CONSTANT, SH_LINEAR = 0.28209479177387814, 0.4886025119029199
 
 
@@ -128,6 +130,23 @@ class RadianceField(torch.nn.Module):
         coefficients = trilinear(self.color_table, coordinates, self.color_resolution)
         basis = torch.cat([torch.full_like(directions[:, :1], SH_CONSTANT), SH_LINEAR * directions], dim=1)
         return torch.sigmoid(torch.einsum("ncb,nb->nc", coefficients.view(-1, 3, SH_COEFFICIENTS), basis))
+
+    def query(self, positions: Tensor) -> tuple[Tensor, Shade]:
+        """Density ``(M,)`` at ``positions (M, 3)``, and colours of rows of them: :class:`~.kinds.TrainableField`."""
+        return self.density_fn(positions)[:, 0], lambda rows, directions: self.color(positions[rows], directions)
+
+    def parameter_groups(self) -> list[tuple[list[torch.nn.Parameter], float]]:
+        """Parameters and their learning rates relative to the run's; see :class:`~.kinds.TrainableField`."""
+        return [(list(self.parameters()), 1.0)]
+
+    def refine(self, share: float) -> bool:
+        """Go to ``share`` in (0, 1] of the configured resolutions; True if that changed them."""
+        sizes = (self.config.resolution, self.config.color_resolution)
+        density, color = (min(size, max(8, round(size * share))) for size in sizes)
+        if (self.resolution, self.color_resolution) == (density, color):
+            return False
+        self.resample(density, color)
+        return True
 
     @torch.no_grad()
     def resample(self, resolution: int, color_resolution: int) -> None:

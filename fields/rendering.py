@@ -1,8 +1,9 @@
-"""Volume rendering of a :class:`RadianceField`."""
+"""Volume rendering of any :class:`~.kinds.TrainableField`."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -10,7 +11,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..core.cameras import Cameras
-from .radiance import RadianceField
+
+if TYPE_CHECKING:
+    from .kinds import TrainableField
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,7 @@ class Rendering:
 
 
 def render_rays(
-    field: RadianceField,
+    field: TrainableField,
     origins: Tensor,
     directions: Tensor,
     sampling: Sampling,
@@ -66,26 +69,29 @@ def render_rays(
 ) -> Rendering:
     """Render rays ``(N, 3)``; with a generator, samples are jittered within their intervals.
 
-    ``occupied``: nodes of :meth:`RadianceField.occupied_nodes`; samples nearest to other nodes are taken as empty.
+    ``occupied``: nodes of the field's ``occupied_nodes``; samples nearest to other nodes are taken as empty.
     """
     edges = sampling.edges().expand(len(origins), -1)
     fraction = torch.rand(len(origins), edges.shape[1] - 1, generator=generator) if generator else torch.tensor(0.5)
     lengths = edges[:, 1:] - edges[:, :-1]
     middles = edges[:, :-1] + fraction * lengths
     positions = origins[:, None] + middles[..., None] * directions[:, None]
+    flat = positions.view(-1, 3)
     if occupied is None:
-        density = field.density_fn(positions)[..., 0]
+        values, shade = field.query(flat)
+        rank, density = torch.arange(len(flat)), values.view(positions.shape[:2])
     else:
-        flat = positions.view(-1, 3)
-        inhabited = occupied[field.nearest_nodes(flat)].nonzero()[:, 0]
-        values = field.density_fn(flat[inhabited])[:, 0]
+        mask = occupied[field.nearest_nodes(flat)]
+        inhabited = mask.nonzero()[:, 0]
+        values, shade = field.query(flat[inhabited])
+        rank = mask.cumsum(0) - 1  # row in what was queried
         density = torch.zeros(len(flat)).index_put((inhabited,), values).view(positions.shape[:2])
     depth = density * lengths
     transmittance = torch.exp(-torch.cumsum(depth, dim=1) + depth)
     weights = transmittance * -torch.expm1(-depth)
     chosen = weights.detach() > sampling.minimal_weight
     ray = chosen.nonzero()[:, 0]
-    color = field.color(positions[chosen], directions[ray])
+    color = shade(rank[chosen.view(-1)], directions[ray])
     rgb = torch.zeros_like(origins).index_add(0, ray, color * weights[chosen][:, None])
     return Rendering(rgb, weights, edges, positions, density)
 
@@ -105,7 +111,7 @@ def median_distance(rendering: Rendering) -> Tensor:
 
 @torch.no_grad()
 def render_view(
-    field: RadianceField,
+    field: TrainableField,
     cameras: Cameras,
     index: int,
     *,

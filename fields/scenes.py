@@ -272,12 +272,14 @@ def photograph(
     noise = rng.uniform(0.0, 0.015)
     images = np.zeros((count, height, width, 3), dtype=np.float32)
     depth_maps = np.zeros((count, height, width))
-    for index in range(count):
-        origins, directions = cameras.rays(index)
-        color, distance = scene.render(origins.reshape(-1, 3), directions.reshape(-1, 3))
-        color = color.reshape(height, width, 3) * exposure[index] + rng.normal(0, noise, size=(height, width, 3))
+    rays = [[ray.reshape(-1, 3) for ray in cameras.rays(index)] for index in range(count)]
+    # all at once: most rays arrive within a few steps, and the long tail of the others is traced together
+    colors, distances = scene.render(*(np.concatenate(part) for part in zip(*rays)))
+    shape = (count, height, width)
+    for index, (color, distance) in enumerate(zip(colors.reshape(*shape, 3), distances.reshape(shape))):
+        color = color * exposure[index] + rng.normal(0, noise, size=(height, width, 3))
         images[index] = np.clip(color, 0, 1)
-        depth_maps[index] = (distance * -(directions.reshape(-1, 3) @ poses[index, :, 2])).reshape(height, width)
+        depth_maps[index] = distance * -(rays[index][1] @ poses[index, :, 2]).reshape(height, width)
     jitter = poses.copy()
     jitter[:, :, 3] += rng.normal(0, _log_uniform(rng, 5e-4, 5e-3), size=(count, 3))
     axis = rng.normal(0, np.deg2rad(_log_uniform(rng, 0.03, 0.25)), size=(count, 3))

@@ -145,15 +145,17 @@ class SolidScene:
         best = np.full(len(positions), np.inf)
         owner = np.zeros(len(positions), dtype=np.int64)
         centers = np.array([solid.center for solid in self.solids])
-        squared = (positions**2).sum(1)[:, None] + (centers**2).sum(1) - 2.0 * positions @ centers.T
-        bounds = np.array([np.inf if solid.inside_out else solid.bound for solid in self.solids])
-        lower = np.sqrt(np.maximum(squared, 0.0)) - bounds - 1e-6
-        for index in np.argsort(lower.min(axis=0)) if len(positions) else ():
-            solid = self.solids[index]
-            chosen = np.flatnonzero(lower[:, index] < best)
+        squared = (centers**2).sum(1)[:, None] + (positions**2).sum(1) - 2.0 * centers @ positions.T
+        bounds = 1e-6 + np.array([np.inf if solid.inside_out else solid.bound for solid in self.solids])
+        lower = np.sqrt(np.maximum(squared.min(axis=1), 0.0)) - bounds if len(positions) else np.zeros(0)
+        for index in np.argsort(lower):
+            if lower[index] >= best.max():
+                break
+            reach = np.maximum(best + bounds[index], 0.0)
+            chosen = np.flatnonzero(squared[index] < reach * reach)
             if not len(chosen):
                 continue
-            value = solid.distance(positions[chosen])
+            value = self.solids[index].distance(positions[chosen])
             closer = value < best[chosen]
             best[chosen[closer]] = value[closer]
             owner[chosen[closer]] = index

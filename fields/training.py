@@ -1,4 +1,4 @@
-"""Fit a :class:`RadianceField` to photos."""
+"""Fit a radiance field of any kind (see :mod:`.kinds`) to photos."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..core.cameras import Cameras
-from .radiance import RadianceField
+from .kinds import TrainableField
 from .rendering import Rendering, Sampling, render_rays
 
-Regularizer = Callable[[RadianceField, int], "Tensor | None"]
+Regularizer = Callable[[TrainableField, int], "Tensor | None"]
 Observer = Callable[[Tensor, Tensor], None]
 
 
@@ -27,7 +27,8 @@ class TrainingConfig:
 
     Attributes:
         rays: rays a step (the paper: 4096).
-        learning_rate, final_learning_rate: Adam's, decayed exponentially over the run.
+        learning_rate, final_learning_rate: Adam's for a dense grid, decayed exponentially over the run; other
+            kinds of field have theirs relative to it.
         fine_tune_learning_rate: held constant with ``fine_tune``.
         distortion_weight: of the mip-NeRF 360 distortion loss (nerfacto has it on by default).
         stages: (share of the run at which it begins, share of the final resolution), coarse to fine.
@@ -100,23 +101,18 @@ class _Progress:
         return max(by_step, by_time)
 
 
-def _optimizer(field: RadianceField, rate: float) -> torch.optim.Adam:
-    return torch.optim.Adam(field.parameters(), lr=rate, betas=(0.9, 0.99), eps=1e-12, fused=True)
+def _optimizer(field: TrainableField) -> torch.optim.Adam:
+    groups = [{"params": parameters, "relative": relative} for parameters, relative in field.parameter_groups()]
+    return torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12, fused=True)
 
 
-def _set_stage(field: RadianceField, stages: tuple[tuple[float, float], ...], done: float) -> bool:
-    """Resample the field if a stage has begun; True if it did."""
-    share = max((stage for stage in stages if stage[0] <= done), key=lambda stage: stage[0])[1]
-    sizes = (field.config.resolution, field.config.color_resolution)
-    density, color = (min(size, max(8, round(size * share))) for size in sizes)
-    if (field.resolution, field.color_resolution) == (density, color):
-        return False
-    field.resample(density, color)
-    return True
+def _set_stage(field: TrainableField, stages: tuple[tuple[float, float], ...], done: float) -> bool:
+    """Refine the field if a stage has begun; True if its parameters are new."""
+    return field.refine(max((stage for stage in stages if stage[0] <= done), key=lambda stage: stage[0])[1])
 
 
 def _render_batch(
-    field: RadianceField,
+    field: TrainableField,
     pixels: tuple[Tensor, Tensor, Tensor],
     config: TrainingConfig,
     generator: torch.Generator,
@@ -134,7 +130,7 @@ def _render_batch(
 
 
 def train_field(
-    field: RadianceField,
+    field: TrainableField,
     cameras: Cameras,
     images: NDArray[np.float32],
     *,
@@ -170,15 +166,16 @@ def train_field(
     done = _Progress(steps, seconds)
     stages = ((0.0, 1.0),) if fine_tune else config.stages
     _set_stage(field, stages, 0.0)
-    optimizer = _optimizer(field, config.learning_rate)
+    optimizer = _optimizer(field)
     errors: list[float] = []
     bar = _bar(progress, steps)
     step = 0
     while (share := done(step)) < 1.0:
         if resampled := _set_stage(field, stages, share):
-            optimizer = _optimizer(field, config.learning_rate)
+            optimizer = _optimizer(field)
+        rate = config.fine_tune_learning_rate if fine_tune else config.rate_at(share)
         for group in optimizer.param_groups:
-            group["lr"] = config.fine_tune_learning_rate if fine_tune else config.rate_at(share)
+            group["lr"] = rate * group["relative"]
         if step % 16 == 0 or resampled:
             skipping = fine_tune or share >= config.skip_from
             occupied = field.occupied_nodes(config.skip_below) if skipping else None

@@ -30,6 +30,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "bench": commands.bench,
         "curate": commands_prior.curate,
         "harvest": commands_prior.harvest,
+        "preview": commands_prior.preview,
         "train": commands_prior.train,
         "export": commands_prior.export,
         "verify": commands_prior.verify,

@@ -1,17 +1,24 @@
+import errno
 import hashlib
 import json
+import pathlib
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from unghost.core.frames import CubeFrame, random_rotations
 from unghost.core.shards import (
     ARRAYS,
+    OPTIONAL_ARRAYS,
     dequantize_signed,
+    pack_frame,
     pack_labels,
     quantize_signed,
     read_shard,
+    stays_within,
+    unpack_frame,
     unpack_labels,
     write_shard,
 )
@@ -23,6 +30,13 @@ GOLDEN = {  # of the shard that `arrays` makes below; a change of these bytes is
     "edge_fraction": "3d9f06ab49bd336909d2bb0e3e129fe432276fcf7690abbcfef7c3387de76b56",
     "group": "28d4b63fdadd72ed19f8fad1638746569959d59ee50d3e10d67810fced9dc78f",
 }
+OPTIONAL_GOLDEN = {  # of `optional` below
+    "surroundings": "abe967333828afa4c583c96182bd02b0a3f61b37f136d6bdc090968dec48cb9b",
+    "view_count": "9449251a75a68516f5dc76752f18b9c357586cdbed4303c5b8f0edf3200d5ba3",
+    "frames": "224ee94ea3dd006d5a83afdbd375d4b1c82b1ea046362013f65a92a5bab0f38c",
+    "source": "c461e9435ee35ce314b3e42cf27575b055fecf1f8272fee6af2d8840c4aff870",
+}
+SOURCES = {"sources": [{"path": "chairs/one.glb", "sha256": "0" * 64, "licence": "CC0-1.0"}]}
 
 
 def arrays(count=2):
@@ -33,6 +47,16 @@ def arrays(count=2):
         "severity": np.linspace(0, 1, count, dtype=np.float32),
         "edge_fraction": np.full(count, 0.25, dtype=np.float32),
         "group": np.arange(count, dtype=np.int32),
+    }
+
+
+def optional():
+    turned = CubeFrame(np.array([0.5, -1.0, 2.0]), 0.25, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]))
+    return {
+        "surroundings": (np.arange(2 * 16**3) * 5 % 256).astype(np.uint8).reshape(2, 16, 16, 16),
+        "view_count": (np.arange(2 * 32**3) * 3 % 256).astype(np.uint8).reshape(2, 32, 32, 32),
+        "frames": np.stack([pack_frame(turned), pack_frame(None)]),
+        "source": np.array([0, -1], dtype=np.int32),
     }
 
 
@@ -76,6 +100,7 @@ def test_labels_by_hand():
         pack_labels(labels + 2)
 
 
+@settings(deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_packing_is_inverse(seed):
     labels = np.random.default_rng(seed).integers(0, 3, size=(2, 32, 32, 32), dtype=np.uint8)
@@ -156,3 +181,164 @@ def test_pickles_are_never_loaded(shard):
     np.save(shard / "group.npy", np.array([{"a": 1}, None], dtype=object), allow_pickle=True)
     with pytest.raises(ValueError, match=r"cannot read .*group\.npy"):
         read_shard(shard)
+
+
+@pytest.mark.parametrize("name", OPTIONAL_ARRAYS)
+def test_golden_bytes_of_optional_arrays(tmp_path, name):
+    write_shard(tmp_path / "s", arrays() | {name: optional()[name]}, SOURCES)
+    assert hashlib.sha256((tmp_path / "s" / f"{name}.npy").read_bytes()).hexdigest() == OPTIONAL_GOLDEN[name]
+    manifest = json.loads((tmp_path / "s" / "manifest.json").read_text(encoding="utf-8"))
+    assert manifest["sha256"] == GOLDEN | {name: OPTIONAL_GOLDEN[name]}
+    assert manifest["format_version"] == 1
+    shard = read_shard(tmp_path / "s", verify=True)
+    for other in OPTIONAL_ARRAYS:
+        if other == name:
+            assert isinstance(getattr(shard, other), np.memmap)
+            np.testing.assert_array_equal(getattr(shard, other), optional()[other])
+        else:
+            assert getattr(shard, other) is None
+
+
+def test_a_frame_by_hand():
+    numbers = optional()["frames"]
+    assert numbers[0].tolist() == [0.5, -1, 2, 0.25, 0, -1, 0, 1, 0, 0, 0, 0, 1]
+    assert np.isnan(numbers[1]).all()
+    assert unpack_frame(numbers[1]) is None
+
+
+@settings(deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_frames_survive_exactly(seed):
+    rng = np.random.default_rng(seed)
+    frame = CubeFrame(rng.normal(size=3), float(rng.uniform(1e-6, 1e3)), random_rotations(rng, 1)[0])
+    back = unpack_frame(pack_frame(frame))
+    np.testing.assert_array_equal(back.center, frame.center)
+    np.testing.assert_array_equal(back.rotation, frame.rotation)
+    assert back.edge_length == frame.edge_length
+
+
+@pytest.mark.parametrize(
+    ("column", "value"), [(0, np.nan), (2, np.inf), (3, 0.0), (3, -1.0), (5, 0.5), (12, np.nan), (12, 2.0), (5, np.inf)]
+)
+def test_frames_that_are_none_are_refused(tmp_path, column, value):
+    wrong = optional()["frames"]
+    wrong[0, column] = value
+    with pytest.raises(ValueError, match="write_shard: each row of frames must be NaN throughout or"):
+        write_shard(tmp_path / "s", arrays() | {"frames": wrong}, {})
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("provenance", "rule"),
+    [
+        ({}, "must hold sources"),
+        ({"sources": {"path": "a"}}, "must hold sources"),
+        ({"sources": ["a"]}, "must hold sources"),
+        ({"sources": []}, r"source must lie in \[-1, 0\), got -1 to 0"),
+        ({"sources": [{"path": "/etc/a.obj"}]}, "must be relative"),
+        ({"sources": [{"path": "a/../../b.obj"}]}, "must be relative"),
+        ({"sources": [{"path": "C:\\b.obj"}]}, "must be relative"),
+    ],
+)
+def test_sources_that_are_none_are_refused(tmp_path, provenance, rule):
+    with pytest.raises(ValueError, match=rule):
+        write_shard(tmp_path / "s", arrays() | {"source": optional()["source"]}, provenance)
+    assert not list(tmp_path.iterdir())
+
+
+def test_paths_by_hand():
+    assert all(stays_within(path) for path in ("a.obj", "a/b c.obj", "..a/b", ""))
+    assert not any(stays_within(path) for path in ("/a", "../a", "a/../b", "C:a", "a\\..\\b", "file:///a"))
+
+
+@pytest.mark.parametrize(("missing", "extra"), [("severity", None), (None, "normals")])
+def test_missing_and_unknown_arrays_are_named(tmp_path, missing, extra):
+    given_arrays = arrays() | ({extra: np.zeros(2)} if extra else {})
+    given_arrays.pop(missing, None)
+    with pytest.raises(ValueError, match=f"write_shard: arrays must hold.*{missing or extra}"):
+        write_shard(tmp_path / "s", given_arrays, {})
+
+
+def test_an_optional_array_is_there_exactly_if_the_manifest_names_it(tmp_path):
+    write_shard(tmp_path / "s", arrays() | optional(), SOURCES)
+    path = tmp_path / "s" / "manifest.json"
+    manifest = json.loads(path.read_text(encoding="utf-8"))
+    hashes = dict(manifest["sha256"])
+    for changed, rule in (
+        ({k: v for k, v in hashes.items() if k != "view_count"}, r"not named \['view_count'\], unknown \[\]"),
+        ({k: v for k, v in hashes.items() if k != "group"}, r"not named \['group'\]"),
+        (hashes | {"normals": "0"}, r"unknown \['normals'\]"),
+    ):
+        path.write_text(json.dumps(manifest | {"sha256": changed}), encoding="utf-8")
+        with pytest.raises(ValueError, match=f"read_shard: .* disagree: .*{rule}"):
+            read_shard(tmp_path / "s")
+    path.write_text(json.dumps(manifest), encoding="utf-8")
+    (tmp_path / "s" / "frames.npy").unlink()
+    with pytest.raises(ValueError, match=r"cannot read .*frames\.npy"):
+        read_shard(tmp_path / "s")
+
+
+def test_overlong_and_transposed_arrays_are_refused(shard):
+    path = shard / "severity.npy"
+    path.write_bytes(path.read_bytes() + b"\0\0\0")
+    with pytest.raises(ValueError, match=r"severity\.npy is 3 bytes longer than its array"):
+        read_shard(shard)
+    np.save(path, arrays()["severity"])
+    np.save(shard / "inputs.npy", np.asfortranarray(arrays()["inputs"]))
+    with pytest.raises(ValueError, match="C order"):
+        read_shard(shard)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("count", None), ("count", True), ("count", "2"), ("sha256", []), ("provenance", None)]
+)
+def test_manifests_that_lack_something_are_refused(shard, key, value):
+    path = shard / "manifest.json"
+    manifest = json.loads(path.read_text(encoding="utf-8"))
+    path.write_text(json.dumps(manifest | {key: value}), encoding="utf-8")
+    with pytest.raises(ValueError, match=f"must hold {key}"):
+        read_shard(shard)
+
+
+@pytest.mark.parametrize("content", [b"[]", b"null", b"\xff\xfe{", b"[" * 100_000])
+def test_manifests_that_are_no_object_are_refused(shard, content):
+    (shard / "manifest.json").write_bytes(content)
+    with pytest.raises(ValueError, match="read_shard: "):
+        read_shard(shard)
+
+
+@pytest.mark.parametrize("where", ["inputs", "severity", "manifest"])
+def test_a_full_disk_is_named_and_leaves_nothing(tmp_path, monkeypatch, where):
+    real = pathlib.Path.open
+
+    def full(self, *args, **kwargs):  # /dev/full fails as a full disk does, with ENOSPC on writing
+        return real(pathlib.Path("/dev/full") if self.stem == where else self, *args, **kwargs)
+
+    monkeypatch.setattr(pathlib.Path, "open", full)
+    with pytest.raises(OSError, match=r"write_shard: cannot write .*No space left on device") as caught:
+        write_shard(tmp_path / "s", arrays(), {})
+    assert caught.value.errno == errno.ENOSPC
+    assert not list(tmp_path.iterdir())
+    monkeypatch.undo()
+    write_shard(tmp_path / "s", arrays(), {})
+    read_shard(tmp_path / "s", verify=True)
+
+
+@settings(deadline=None)
+@given(st.integers(0, 5), st.floats(0, 1, exclude_max=True))
+def test_a_shard_cut_anywhere_is_refused(whole, which, share):
+    folder, files = whole
+    path = folder / [*(f"{name}.npy" for name in ARRAYS), "manifest.json"][which]
+    path.write_bytes(files[path.name][: int(share * len(files[path.name]))])
+    try:
+        with pytest.raises(ValueError, match="read_shard: "):
+            read_shard(folder)
+    finally:
+        path.write_bytes(files[path.name])
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("whole") / "s"
+    write_shard(folder, arrays(), {})
+    return folder, {path.name: path.read_bytes() for path in folder.iterdir()}

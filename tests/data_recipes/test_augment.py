@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from unghost.core.frames import unit_lattice
-from unghost.data_recipes.augment import CORRUPTIONS, changed_fraction, corrupt
+from unghost.data_recipes.augment import CORRUPTIONS, changed_fraction, corrupt, soften
 from unghost.data_recipes.compose import dilate, sample_cube
 from unghost.data_recipes.recipe import Recipe
 
@@ -97,6 +97,54 @@ def test_mean_overlap_falls_as_stated():
             noisy = corrupt(np.random.default_rng(i), clean, severity)
             overlaps.append((noisy & clean).sum() / (noisy | clean).sum())
         assert np.mean(overlaps) == pytest.approx(expected, abs=0.03)
+
+
+def changed_share(family, clean, severity, seeds):
+    """Mean share of voxels that change, over ``seeds`` generators."""
+    return np.mean([(family(np.random.default_rng(seed), clean, severity) ^ clean).mean() for seed in range(seeds)])
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    name=st.sampled_from(sorted(CORRUPTIONS)),
+    seed=st.integers(0, 2**31),
+    levels=st.tuples(st.floats(0, 1), st.floats(0, 1)),
+    resolution=st.sampled_from([2, 3, 8, 17]),
+    share=st.sampled_from([0.0, 0.01, 0.2, 0.9, 1.0]),
+)
+def test_what_changes_at_a_severity_also_changes_above_it(name, seed, levels, resolution, share):
+    """Not on average only: with the same random numbers the flips are nested, for any cube and any two severities."""
+    clean = np.random.default_rng(seed).random((resolution,) * 3) < share
+    few, many = (CORRUPTIONS[name](np.random.default_rng(seed), clean, severity) ^ clean for severity in sorted(levels))
+    assert (few <= many).all()
+    assert not (CORRUPTIONS[name](np.random.default_rng(seed), clean, 0.0) ^ clean).any()
+
+
+@pytest.mark.parametrize("name", ["corrupt", "soften"])
+def test_the_mix_changes_more_with_severity_on_average(name):
+    """For the mix only the average grows: its families' shares of a severity may be drawn anew."""
+    clean = dilate(SHELL, 1)
+
+    def family(rng, cube, severity):
+        noisy = corrupt(rng, cube, severity)
+        return noisy if name == "corrupt" else soften(rng, cube, noisy, severity) > -0.8
+
+    changes = [changed_share(family, clean, severity, 60) for severity in (0.0, 0.1, 0.3, 0.5, 0.8, 1.0)]
+    assert changes[0] == 0
+    assert changes == sorted(changes)
+    assert changes[-1] > 3 * changes[1]
+
+
+@pytest.mark.parametrize("severity", [-0.1, 1.0001, float("nan"), float("inf")])
+@pytest.mark.parametrize("name", ALL)
+def test_severity_outside_its_range_is_refused(name, severity):
+    with pytest.raises(ValueError, match=r"severity must lie in \[0, 1\], got"):
+        ALL[name](np.random.default_rng(0), SHELL, severity)
+
+
+@pytest.mark.parametrize("name", CORRUPTIONS)
+def test_every_family_says_what_it_does(name):
+    assert len(CORRUPTIONS[name].__doc__.split()) > 5
 
 
 @settings(max_examples=30, deadline=None)

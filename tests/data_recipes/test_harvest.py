@@ -7,10 +7,12 @@ import pytest
 from unghost.core.aabb import contains
 from unghost.core.cameras import Cameras
 from unghost.core.frames import cube_lattices
-from unghost.core.occupancy import FREE_LABEL, IGNORE_LABEL, SURFACE_LABEL
-from unghost.core.shards import dequantize_signed, read_shard, unpack_labels
+from unghost.core.occupancy import FREE_LABEL, IGNORE_LABEL, opacity_from_density
+from unghost.core.shards import dequantize_signed, read_shard, unpack_frame, unpack_labels
 from unghost.data_recipes import harvest as module
-from unghost.data_recipes.harvest import HarvestConfig, Truth, harvest, harvest_scene, room_scene, severity_of
+from unghost.data_recipes.harvest import HarvestConfig, harvest, harvest_scene, room_scene
+from unghost.data_recipes.harvest_context import count_views
+from unghost.data_recipes.harvest_labels import Truth, severity_of
 
 torch = pytest.importorskip("torch")
 scenes = pytest.importorskip("unghost.fields.scenes")
@@ -50,104 +52,6 @@ def photographed():
     depth = [scene.trace(*ray) * -(ray[1] @ poses[index, :, 2]) for index, ray in enumerate(rays)]
     images = np.zeros((2, 30, 40, 3), dtype=np.float32)
     return scenes.PhotographedScene(scene, cameras, cameras, images, np.stack(depth).reshape(2, 30, 40))
-
-
-def labels_one_by_one(photographed, positions, pitch, opaque):
-    """The definition in the module's text, a point at a time, with the plain minimum over all solids."""
-    labels = []
-    for position, filled in zip(positions, opaque):
-        distance = min(float(solid.distance(position[None])[0]) for solid in photographed.scene.solids)
-        seen, shallow = False, False
-        for index in range(len(photographed.true_cameras)):
-            pixel, depth, visible = photographed.true_cameras.project(index, position)
-            if visible:
-                row, column = min(int(pixel[1]), 29), min(int(pixel[0]), 39)
-                front = photographed.depth_maps[index, row, column]
-                seen |= bool(depth <= 1.02 * (front + 2 * pitch))
-                shallow |= bool(depth <= 1.02 * (front + 6 * pitch))
-        if not ((position >= -1) & (position <= 1)).all():
-            labels.append(IGNORE_LABEL)
-        elif distance > 1.5 * pitch:
-            labels.append(FREE_LABEL)
-        elif seen if abs(distance) <= 0.75 * pitch else filled and shallow and -4 * pitch <= distance < 0:
-            labels.append(SURFACE_LABEL)
-        else:
-            labels.append(IGNORE_LABEL)
-    return np.array(labels)
-
-
-@pytest.mark.parametrize("pitch", [0.02, 0.06])
-@pytest.mark.parametrize("nodes", [8, 64])
-def test_labels_follow_their_definition(photographed, pitch, nodes):
-    rng = np.random.default_rng(1)
-    positions = rng.uniform(-1.1, 1.1, size=(2500, 3))
-    opaque = rng.random(2500) < 0.5
-    labels = Truth(photographed, AABB, nodes=nodes).labels(positions, pitch, opaque)
-    assert labels.dtype == np.uint8
-    np.testing.assert_array_equal(labels, labels_one_by_one(photographed, positions, pitch, opaque))
-    assert set(np.unique(labels)) == {FREE_LABEL, SURFACE_LABEL, IGNORE_LABEL}
-
-
-def test_labels_by_hand(photographed):
-    truth = Truth(photographed, AABB)
-    ball = np.array([0.2, 0.3, -0.1])
-    toward = np.array([0.7, 0.0, 0.5]) / np.linalg.norm([0.7, 0.0, 0.5])
-    positions = np.stack([
-        ball + 0.3 * toward,  # the skin that the cameras see
-        ball + np.array([-0.3, 0.0, 0.0]),  # the skin that they do not
-        ball,  # deep inside
-        ball + 0.24 * toward,  # three cells behind the skin that they see
-        ball + np.array([-0.24, 0.0, 0.0]),  # three cells behind the skin that they do not
-        ball + 0.32 * toward,  # one cell out: the band between
-        np.array([0.0, 0.0, 0.9]),  # air
-        np.array([0.0, 0.0, 1.1]),  # air outside the box
-    ]).reshape(2, 4, 3)  # fmt: skip
-    opaque = np.ones((2, 4), dtype=bool)
-    seen, ignored, free = SURFACE_LABEL, IGNORE_LABEL, FREE_LABEL
-    expected = np.array([[seen, ignored, ignored, seen], [ignored, ignored, free, ignored]])
-    np.testing.assert_array_equal(truth.labels(positions, 0.02, opaque), expected)
-    expected[0, 3] = ignored  # what the field left empty behind the skin is no fault
-    np.testing.assert_array_equal(truth.labels(positions, 0.02, ~opaque), expected)
-
-
-def test_coarse_distances_are_exact_where_it_matters(photographed):
-    points = np.random.default_rng(2).uniform(-1, 1, size=(5000, 3))
-    exact = photographed.scene.signed_distance(points)
-    for margin in (0.0, 0.05, 0.3):
-        found = Truth(photographed, AABB, nodes=12).distances(points, margin)
-        close = np.abs(exact) <= margin
-        np.testing.assert_allclose(found[close], exact[close], atol=1e-12)
-        assert (np.abs(found[~close]) > margin).all()
-        np.testing.assert_array_equal(found > margin, exact > margin)
-
-
-def test_severity_by_hand():
-    inputs = np.full((4, 32, 32, 32), -1.0, dtype=np.float32)
-    labels = np.full((4, 32, 32, 32), FREE_LABEL, dtype=np.uint8)
-    inputs[0, 0, 0, :6] = 0.0  # opacity 0.5: six opaque voxels
-    labels[0, 0, 0, 4:8] = SURFACE_LABEL  # four of the surface, two of them opaque: 2 / 8
-    inputs[1, 0, 0, :6] = 1.0
-    labels[1, 0, 0, :6] = IGNORE_LABEL  # nothing that counts: as good as can be
-    labels[2, 0] = SURFACE_LABEL  # a surface that the field misses
-    inputs[3, 0] = -0.85  # opacity 0.075: not opaque
-    np.testing.assert_allclose(severity_of(inputs, labels), [0.75, 0.0, 1.0, 0.0])
-    assert severity_of(inputs[:0], labels[:0]).shape == (0,)
-
-
-def test_failed_fits_are_refused():
-    inputs = np.full((1, 10, 10, 10), -1.0, dtype=np.float32)
-    labels = np.full((1, 10, 10, 10), FREE_LABEL, dtype=np.uint8)
-    labels[0, 0] = SURFACE_LABEL  # a hundred voxels
-    inputs[0, 0, 0] = 0.0  # ten of them opaque
-    inputs[0, 1:9, 0] = 0.0  # and eighty ghosts: 8 to 1
-    module.check_fit(inputs, labels, HarvestConfig())
-    inputs[0, 9, :2] = 0.0  # a hundred ghosts: 10 to 1
-    with pytest.raises(RuntimeError, match="91% of what is opaque are ghosts"):
-        module.check_fit(inputs, labels, HarvestConfig())
-    inputs[0, 0, 0, 0] = -1.0
-    with pytest.raises(RuntimeError, match="9% of the surface is opaque"):
-        module.check_fit(inputs, labels, HarvestConfig())
-    module.check_fit(inputs[:0], labels[:0], HarvestConfig())
 
 
 def test_one_scene_end_to_end_and_again(tmp_path):
@@ -216,6 +120,88 @@ def test_cubes_outside_the_box_are_empty_and_ignored(photographed, monkeypatch):
     assert (unpack_labels(arrays["labels"])[outside] == IGNORE_LABEL).all()
 
 
+def test_a_cube_is_stored_with_what_is_about_it(photographed):
+    from unghost.fields.kinds import make_field
+
+    field = make_field("hash", 24, initial_opacity=0.2, seed=1)
+    with torch.no_grad():
+        field.table.normal_(0, 1, generator=torch.Generator().manual_seed(2))
+    config = replace(TINY, cubes=module.TOGETHER + 3)
+    arrays = module.harvest_cubes(np.random.default_rng(4), field, Truth(photographed, AABB), config)
+    assert {name: len(array) for name, array in arrays.items()} == dict.fromkeys(arrays, config.cubes)
+    frames = arrays["frames"]
+    views = count_views(photographed.cameras, frames[:, :3], frames[:, 3], frames[:, 4:].reshape(-1, 3, 3))
+    np.testing.assert_array_equal(arrays["view_count"], views)
+    np.testing.assert_allclose(arrays["edge_fraction"], frames[:, 3] / 2.0, rtol=1e-6)
+    for row in (0, module.TOGETHER, config.cubes - 1):
+        frame = unpack_frame(frames[row])
+        wider = replace(frame, edge_length=3 * frame.edge_length)
+        for lattice, stored, pool in (
+            (frame.lattice(), arrays["inputs"][row], 1),
+            (wider.lattice(), arrays["surroundings"][row], 2),
+        ):
+            check_opacity(field, lattice, stored / 255, pool)
+
+
+def check_opacity(field, lattice, opacity, pool):
+    """``opacity`` is the field's at ``lattice``, averaged, with a pitch within exp(-.3) to exp(.3) of the field's."""
+    density = field.density_fn(torch.from_numpy(lattice).float())[..., 0].detach().numpy()
+    density[~contains(AABB, lattice)] = 0.0
+    side = 32 // pool
+    bounds = []
+    for factor in np.exp([-0.3, 0.3]):
+        blocks = opacity_from_density(density, field.field_pitch * factor).reshape(side, pool, side, pool, side, pool)
+        bounds.append(blocks.mean(axis=(1, 3, 5)))
+    assert (opacity >= bounds[0] - 0.003).all()
+    assert (opacity <= bounds[1] + 0.003).all()
+    assert opacity.max() > 0.1
+
+
+@pytest.mark.parametrize("kind", module.KINDS)
+def test_any_kind_of_field_is_harvested(kind, tmp_path):
+    config = replace(TINY, kinds=(kind,), shares=(1.0,), steps=(5, 6), cubes=1)
+    assert harvest(tmp_path, scenes=1, seed=3, first=5, config=config) == 2 * config.cubes
+    shard = read_shard(tmp_path / "scene-00005", verify=True)
+    assert shard.provenance["field"] == kind
+    assert shard.provenance["field_pitch"] == pytest.approx(4 / shard.provenance["resolution"], rel=0.1)
+    assert shard.surroundings is not None
+    assert shard.frames is not None
+    assert shard.view_count.max() <= shard.provenance["photos"]
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # as the workers have it
+    try:
+        again = harvest_scene(3, 5, config)[0]
+    finally:
+        torch.set_num_threads(threads)
+    for name, array in again.items():
+        np.testing.assert_array_equal(getattr(shard, name), array, err_msg=name)
+
+
+def test_kinds_come_in_their_shares_in_the_same_rooms():
+    from unghost.fields.kinds import KINDS
+
+    assert set(module.KINDS) == set(KINDS)
+    assert not set(HarvestConfig().kinds) & set(module.HELD_OUT_KINDS)
+    assert set(HarvestConfig().kinds) | set(module.HELD_OUT_KINDS) == set(KINDS)
+    assert module.HarvestConfig().shares == (0.5, 0.5)
+    config = replace(TINY, kinds=("dense", "hash"), shares=(1.0, 3.0))
+    drawn = [module._draw_field(np.random.default_rng([1, index]), config)[0] for index in range(400)]
+    assert 0.68 < drawn.count("hash") / 400 < 0.82  # 3 of 4, give or take three standard deviations
+
+
+def test_a_scene_that_fails_is_told_and_the_run_goes_on(tmp_path, monkeypatch):
+    from unghost.fields import training
+
+    def diverge(*args, **kwargs):
+        raise FloatingPointError("train_field: the loss is not finite at step 3")
+
+    monkeypatch.setattr(training, "train_field", diverge)
+    monkeypatch.setattr(torch, "set_num_threads", lambda count: None)  # this process keeps its own
+    index, problem = module._work(str(tmp_path), 3, 5, TINY, True)
+    assert (index, problem) == (5, "train_field: the loss is not finite at step 3")
+    assert not list(tmp_path.iterdir())
+
+
 def test_proposals_prefer_what_is_opaque():
     from unghost.fields.radiance import RadianceConfig, RadianceField
 
@@ -251,6 +237,11 @@ def test_bad_counts_are_refused_before_anything_is_written(tmp_path, arguments):
         ({"photos": (5, 2)}, r"photos must be \(low, high\) with 0 < low <= high, got \(5, 2\)"),
         ({"steps": (0, 10)}, r"steps must be .* got \(0, 10\)"),
         ({"voxel_pitch": (-1.0, 1.0)}, r"voxel_pitch must be"),
+        ({"kinds": ("dense", "splat")}, r"kinds must be different ones of dense, hash, mlp, got .*splat"),
+        ({"kinds": ("hash", "hash")}, "kinds must be different ones"),
+        ({"kinds": (), "shares": ()}, "kinds must be different ones"),
+        ({"kinds": ("mlp",)}, r"shares must be one finite number > 0 for each of \('mlp',\), got \(0.5, 0.5\)"),
+        ({"shares": (1.0, 0.0)}, "shares must be one finite number > 0"),
         ({"cubes": 0}, "rays and cubes must be >= 1, got 1152 and 0"),
     ],
 )

@@ -6,8 +6,8 @@ from unghost.data_recipes.recipe import Recipe, builtin_recipes, load_recipe, re
 
 
 def test_builtin_recipes_load_under_their_own_names():
-    assert {"procedural", "meshes"} <= set(builtin_recipes())
-    for name in ("procedural", "meshes"):
+    assert {"procedural", "meshes", "csg"} <= set(builtin_recipes())
+    for name in ("procedural", "meshes", "csg"):
         assert load_recipe(name).name == load_recipe(name).source == name
 
 
@@ -19,13 +19,20 @@ def test_a_file_reads_like_a_builtin(tmp_path):
     assert recipe.families == ("box", "ball")
 
 
+def test_an_unknown_key_without_a_near_one_gets_no_suggestion():
+    with pytest.raises(ValueError, match=r"unknown keys \['zzz'\]; known: "):
+        recipe_from_mapping({"zzz": 3})
+
+
 def test_json_round_trip():
     recipe = load_recipe("meshes")
     assert recipe_from_mapping(recipe.to_dict()) == recipe
 
 
 def test_unknown_key_is_refused_and_known_ones_are_listed():
-    with pytest.raises(ValueError, match=r"unknown keys \['max_dilatation'\]; known: .*max_dilation"):
+    with pytest.raises(
+        ValueError, match=r"unknown keys \['max_dilatation'\] \(did you mean max_dilation\?\); known: name"
+    ):
         recipe_from_mapping({"max_dilatation": 3})
 
 
@@ -41,15 +48,28 @@ def test_unknown_key_is_refused_and_known_ones_are_listed():
         ({"on_share": 0.8, "near_share": 0.3}, "on_share"),
         ({"max_dilation": -1}, "max_dilation must be whole and >= 0"),
         ({"parts": (0, 3)}, "parts must be"),
-        ({"source": "cad"}, "source must be one of procedural, meshes, got 'cad'"),
+        ({"source": "cad"}, "source must be one of procedural, meshes, csg, got 'cad'"),
         ({"split": "all"}, "split must be one of train, val, test"),
         ({"families": ("box", "bunny")}, r"unknown families \['bunny'\]; known: wall"),
+        ({"families": ("box", "bal")}, r"unknown families \['bal'\] \(did you mean ball\?\); known: wall"),
         ({"severity_exponent": 0.0}, "severity_exponent"),
+        (
+            {"remesh_edge": 0.02},
+            r"remesh_edge must be 0, or in \[0.001, 0.5\] where repair is true, got 0.02 with .* false",
+        ),
+        ({"repair": True, "remesh_edge": 0.6}, "remesh_edge must be 0, or in"),
     ],
 )
 def test_bad_values_name_the_key(change, message):
     with pytest.raises(ValueError, match=message):
         dataclasses.replace(Recipe(), **change)
+
+
+def test_truth_values_are_read():
+    assert recipe_from_mapping({"repair": True, "remesh_edge": 0.02}).repair is True
+    for wrong in (1, "yes", 0.0):
+        with pytest.raises(ValueError, match="repair must be a bool"):
+            recipe_from_mapping({"repair": wrong})
 
 
 def test_wrong_types_are_refused():
@@ -60,7 +80,7 @@ def test_wrong_types_are_refused():
 
 
 def test_missing_and_broken_files(tmp_path):
-    with pytest.raises(FileNotFoundError, match="neither a file nor a built-in recipe"):
+    with pytest.raises(FileNotFoundError, match=r"neither a file nor a built-in recipe \(did you mean procedural\?\)"):
         load_recipe("procedurall")
     path = tmp_path / "broken.toml"
     path.write_text("name = ", encoding="utf-8")

@@ -1,0 +1,315 @@
+"""How fast cubes are made, beside slicing and voxelising with trimesh and beside open3d's voxel grid.
+
+    OMP_NUM_THREADS=1 python benchmarks/curate.py             (about four minutes on two idle cores)
+    OMP_NUM_THREADS=1 python benchmarks/curate.py --quick     (half a minute, for a look)
+
+Mesh rows cut cubes of a generated bumpy ball: edges log-uniform, from choosing where the cube lies to its packed
+bits, no corruption. ``mesh/trimesh`` slices the mesh at the six faces of the cube and voxelises the rest, as the
+published pipeline did before its external binary; ``mesh/open3d`` is given the cube's own triangles, found by our
+tree, and pays for its voxel grid alone. ``procedural/every-voxel`` asks the same objects' distance at all voxels.
+Every row says how its cubes agree with ours (``iou``), and ours are compared with the 13 separating axes by the book
+before anything is timed. ``milliseconds`` is processor time a cube; ``cubes_per_second`` wall time of all workers.
+Writes curate.json and curate.png.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import multiprocessing
+import resource
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from numpy.typing import NDArray
+
+from unghost.core.frames import RESOLUTION, CubeFrame
+from unghost.core.results import build_results, write_results
+from unghost.data_recipes import compose
+from unghost.data_recipes.crops import choose_frame, cut_cubes, sample_mesh_cubes
+from unghost.data_recipes.meshes import Mesh
+from unghost.data_recipes.recipe import Recipe, load_recipe
+from unghost.data_recipes.voxelize import voxelize_triangles_slowly
+
+ROOT = Path(__file__).resolve().parents[1]
+SEED = 3
+TOGETHER = 16
+FACES = 70_000
+SWEEP_FACES = (1_000, 4_000, 16_000, 70_000, 250_000, 1_000_000)
+SWEEP_EDGES = (0.01, 0.02, 0.04, 0.07, 0.1, 0.2)
+RECIPE = dataclasses.replace(load_recipe("meshes"), edge_fraction=(0.01, 0.1))
+PROCEDURAL = load_recipe("procedural")
+
+Occupancy = NDArray[np.bool_]
+Packed = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to measure.
+
+    Attributes:
+        workers: processes.
+        cubes: of the rows of this project; the others make fewer, as many as their speed allows.
+        quick: a tenth of all cubes, and no mesh of more than 70,000 faces.
+        out: where curate.json and curate.png go.
+    """
+
+    workers: int = 2
+    cubes: int = 16_000
+    quick: bool = False
+    out: Path = ROOT / "docs" / "results"
+
+
+def bumpy_ball(faces: int) -> NDArray[np.float64]:
+    """About ``faces`` triangles ``(F, 3, 3)`` of a ball with bumps: a cube's faces, gridded and blown up."""
+    count = max(1, round(np.sqrt(faces / 12)))
+    axis = np.tan(np.linspace(-np.pi / 4, np.pi / 4, count + 1))
+    u, v = np.meshgrid(axis, axis, indexing="ij")
+    soup = []
+    for side in range(6):
+        sign = 1.0 if side % 2 else -1.0
+        grid = np.roll(np.stack([np.full_like(u, sign), sign * u, v], axis=-1), side // 2, axis=-1)
+        way = grid / np.linalg.norm(grid, axis=-1, keepdims=True)
+        x, y, z = np.moveaxis(way, -1, 0)
+        bumps = 0.12 * np.sin(5 * x) * np.sin(4 * y + 1) + 0.05 * np.sin(17 * x) * np.sin(15 * y) * np.sin(13 * z)
+        points = way * (1.0 + bumps + 0.01 * np.sin(41 * (x + y)) * np.sin(37 * z))[..., None]
+        a, b, c, d = points[:-1, :-1], points[1:, :-1], points[1:, 1:], points[:-1, 1:]
+        soup += [np.stack(corners, axis=-2).reshape(-1, 3, 3) for corners in ((a, b, c), (a, c, d))]
+    return np.concatenate(soup)
+
+
+@lru_cache(maxsize=1)
+def ball(faces: int = FACES) -> Mesh:
+    return Mesh.from_triangles(bumpy_ball(faces))
+
+
+def generators(start: int, stop: int) -> list[np.random.Generator]:
+    return [np.random.default_rng([SEED, index]) for index in range(start, stop)]
+
+
+def pack(occupancy: Occupancy) -> Packed:
+    return np.packbits(occupancy.reshape(len(occupancy), -1), axis=1)
+
+
+def our_meshes(start: int, stop: int) -> Packed:
+    parts = range(start, stop, TOGETHER)
+    return np.concatenate(
+        [pack(sample_mesh_cubes(generators(i, min(i + TOGETHER, stop)), ball(), RECIPE)[0]) for i in parts]
+    )
+
+
+def our_procedural(start: int, stop: int) -> Packed:
+    return np.concatenate([pack(compose.sample_cube(rng, PROCEDURAL)[0][None]) for rng in generators(start, stop)])
+
+
+def every_voxel(start: int, stop: int) -> Packed:
+    """The same objects and cubes, their distance asked at every voxel."""
+
+    def plainly(distance: Any, center: Any, rotation: Any, edge: float, *, thickness: float, solid: bool) -> Occupancy:
+        values = distance(CubeFrame(center, edge, rotation).lattice().reshape(-1, 3)).reshape((RESOLUTION,) * 3)
+        shell = compose.shell_from_distance(values.astype(np.float32), thickness=thickness)
+        return shell | (values < 0) if solid else shell
+
+    kept, compose.shell_in_cube = compose.shell_in_cube, plainly
+    try:
+        return our_procedural(start, stop)
+    finally:
+        compose.shell_in_cube = kept
+
+
+def frames(start: int, stop: int) -> list[CubeFrame]:
+    return [choose_frame(rng, ball(), RECIPE) for rng in generators(start, stop)]
+
+
+def undilated(start: int, stop: int) -> Packed:
+    return pack(cut_cubes(ball(), frames(start, stop)))
+
+
+@lru_cache(maxsize=1)
+def welded_ball() -> Any:
+    """The ball as trimesh holds a mesh read from a file: corners shared."""
+    import trimesh
+
+    return trimesh.Trimesh(**trimesh.triangles.to_kwargs(ball().triangles), process=True)
+
+
+def with_trimesh(start: int, stop: int) -> Packed:
+    import trimesh
+
+    cubes = np.zeros((stop - start,) + (RESOLUTION,) * 3, dtype=bool)
+    for cube, frame in zip(cubes, frames(start, stop)):
+        vertices, faces = np.asarray(welded_ball().vertices), np.asarray(welded_ball().faces)
+        for axis, side in ((axis, side) for axis in range(3) for side in (-1.0, 1.0)):
+            normal = frame.rotation[:, axis] * side
+            origin = frame.center - normal * frame.edge_length / 2
+            vertices, faces = trimesh.intersections.slice_faces_plane(vertices, faces, normal, origin)[:2]
+        if len(faces) == 0:
+            continue
+        lattice = frame.to_local(vertices) * RESOLUTION + (RESOLUTION - 1) / 2  # trimesh's: centres at whole numbers
+        grid = trimesh.Trimesh(lattice, faces, process=False).voxelized(pitch=1.0)
+        index = np.rint(grid.points).astype(int)
+        cube[tuple(index[((index >= 0) & (index < RESOLUTION)).all(axis=1)].T)] = True
+    return pack(cubes)
+
+
+def with_open3d(start: int, stop: int) -> Packed:
+    import open3d
+
+    cubes = np.zeros((stop - start,) + (RESOLUTION,) * 3, dtype=bool)
+    corner = np.full(3, 0.5)
+    for cube, frame in zip(cubes, frames(start, stop)):
+        reach = np.abs(frame.rotation).sum(axis=1) * frame.edge_length / 2
+        rows = ball().tree.touching((frame.center - reach)[None], (frame.center + reach)[None])[1]
+        soup = frame.to_local(ball().triangles[rows]).reshape(-1, 3)
+        mesh = open3d.geometry.TriangleMesh(
+            open3d.utility.Vector3dVector(soup), open3d.utility.Vector3iVector(np.arange(len(soup)).reshape(-1, 3))
+        )
+        grid = open3d.geometry.VoxelGrid.create_from_triangle_mesh_within_bounds(mesh, 1 / RESOLUTION, -corner, corner)
+        index = np.array([voxel.grid_index for voxel in grid.get_voxels()]).reshape(-1, 3)
+        cube[tuple(index[((index >= 0) & (index < RESOLUTION)).all(axis=1)].T)] = True  # it goes on beyond its bounds
+    return pack(cubes)
+
+
+def check_meshes(count: int) -> None:
+    """Cubes of the ball, of few triangles and of many, against the 13 axes; a batch against one by one."""
+    drawn = sorted(frames(0, 40 * count), key=lambda frame: frame.edge_length)[::40][:count]
+    for cube, frame in zip(cut_cubes(ball(), drawn), drawn):
+        reach = np.full((1, 3), frame.edge_length)
+        rows = ball().tree.touching(frame.center - reach, frame.center + reach)[1]
+        assert np.array_equal(cube, voxelize_triangles_slowly(frame.to_local(ball().triangles[rows])))
+        assert np.array_equal(cube, cut_cubes(ball(), [frame])[0])
+
+
+def agreement(found: Packed, expected: Packed) -> float:
+    """Mean IoU of the cubes that are not empty in both."""
+    a, b = np.unpackbits(found, axis=1).astype(bool), np.unpackbits(expected, axis=1).astype(bool)
+    either = (a | b).sum(axis=1)
+    return float(((a & b).sum(axis=1)[either > 0] / either[either > 0]).mean())
+
+
+def timed(method: Callable[[int, int], Packed], start: int, stop: int) -> tuple[Packed, float, float]:
+    """Cubes, processor seconds, and the process's peak memory in megabytes."""
+    before = time.process_time()
+    cubes = method(start, stop)
+    spent = time.process_time() - before
+    unit = 1e6 if sys.platform == "darwin" else 1e3
+    return cubes, spent, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A way of making cubes: at what share of ours it is asked, and what it should agree with."""
+
+    name: str
+    method: Callable[[int, int], Packed]
+    share: float
+    same_as: Callable[[int, int], Packed]
+    least_iou: float
+    faces: int | None = None
+
+
+CONTENDERS = (
+    Contender("mesh/unghost", our_meshes, 1.0, our_meshes, 1.0, FACES),
+    Contender("mesh/trimesh", with_trimesh, 0.01, undilated, 0.8, FACES),
+    Contender("mesh/open3d", with_open3d, 0.01, undilated, 0.95, FACES),
+    Contender("procedural/unghost", our_procedural, 1.0, our_procedural, 1.0),
+    Contender("procedural/every-voxel", every_voxel, 0.1, our_procedural, 0.9999),
+)
+
+
+def warm_up(method: Callable[[int, int], Packed], barrier: Any) -> None:
+    """In a worker: load everything, then wait for the others."""
+    method(0, 2)
+    barrier.wait(timeout=600)
+
+
+def measure(contender: Contender, options: Options) -> dict[str, Any]:
+    """One row: fresh workers, warm ones, then the clock."""
+    count = max(2 * options.workers, round(options.cubes * contender.share))
+    length = max(1, min(256, count // (4 * options.workers)))
+    bounds = [(contender.method, start, min(start + length, count)) for start in range(0, count, length)]
+    context = multiprocessing.get_context("spawn")
+    barrier = context.Barrier(options.workers + 1)
+    with context.Pool(options.workers, warm_up, (contender.method, barrier)) as pool:
+        barrier.wait(timeout=600)
+        before = time.perf_counter()
+        made = pool.starmap(timed, bounds, chunksize=1)
+        wall = time.perf_counter() - before
+    cubes = np.concatenate([part for part, _, _ in made])
+    checked = min(count, 200)
+    iou = agreement(cubes[:checked], np.concatenate([contender.same_as(i, i + 1) for i in range(checked)]))
+    assert iou >= contender.least_iou, f"{contender.name}: IoU {iou}"
+    spent, peak = sum(cpu for _, cpu, _ in made), max(memory for _, _, memory in made)
+    return {
+        "method": contender.name, "workers": options.workers, "cubes": count, "faces": contender.faces,
+        "cubes_per_second": count / wall, "milliseconds": spent / count * 1e3, "peak_megabytes": peak, "iou": iou,
+    }  # fmt: skip
+
+
+def sweep(mesh: Mesh, recipe: Recipe, cubes: int) -> float:
+    """Processor milliseconds a cube, one thread."""
+    sample_mesh_cubes(generators(0, TOGETHER), mesh, recipe)
+    before = time.process_time()
+    for start in range(0, cubes, TOGETHER):
+        pack(sample_mesh_cubes(generators(start, start + TOGETHER), mesh, recipe)[0])
+    return (time.process_time() - before) / (-(-cubes // TOGETHER) * TOGETHER) * 1e3
+
+
+def sweeps(options: Options, cubes: int) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = []
+    for faces in SWEEP_FACES:
+        if options.quick and faces > FACES:
+            continue
+        soup = bumpy_ball(faces)
+        before = time.process_time()
+        mesh = Mesh.from_triangles(soup)
+        seconds = time.process_time() - before
+        held = [mesh.triangles, mesh.normals, mesh.cumulative_areas, mesh.tree.rows, *mesh.tree.levels]
+        rows.append({
+            "method": "mesh/unghost", "sweep": "faces", "faces": len(mesh.triangles), "seconds": seconds,
+            "megabytes": sum(array.nbytes for array in held) / 1e6, "milliseconds": sweep(mesh, RECIPE, cubes),
+        })  # fmt: skip
+    for edge in SWEEP_EDGES:
+        found = sweep(ball(), dataclasses.replace(RECIPE, edge_fraction=(edge, edge)), cubes)
+        rows.append({"method": "mesh/unghost", "sweep": "edge_fraction", "edge_fraction": edge, "milliseconds": found})
+    return rows
+
+
+def plot(rows: Sequence[dict[str, Any]], path: Path) -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    for axes, key, label in zip(figure.subplots(1, 2), ("faces", "edge_fraction"), ("faces", "edge fraction")):
+        points = [(row[key], row["milliseconds"]) for row in rows if row.get("sweep") == key]
+        axes.loglog(*zip(*points), marker="o", label="unghost")
+        for row in rows:
+            if row["method"] in ("mesh/trimesh", "mesh/open3d"):
+                axes.axhline(row["milliseconds"], linestyle=":", color="grey")
+                axes.annotate(f"{row['method'][5:]}, {FACES:,} faces", (points[0][0], row["milliseconds"]), fontsize=8)
+        axes.set(xlabel=label, ylabel="processor milliseconds a cube")
+    figure.savefig(path, dpi=120)
+
+
+def main(options: Options) -> list[dict[str, Any]]:
+    if options.quick:
+        options = dataclasses.replace(options, cubes=options.cubes // 10)
+    check_meshes(6 if options.quick else 24)
+    rows = [measure(contender, options) for contender in CONTENDERS]
+    rows += sweeps(options, max(TOGETHER, options.cubes // 16))
+    command = "python benchmarks/curate.py" + " --quick" * options.quick + f" --workers {options.workers}"
+    options.out.mkdir(parents=True, exist_ok=True)
+    write_results(options.out / "curate.json", build_results(rows, command=command, seeds=[SEED]))
+    plot(rows, options.out / "curate.png")
+    return rows
+
+
+if __name__ == "__main__":
+    for row in main(tyro.cli(Options, description=__doc__)):
+        print(" ".join(f"{k}={v:.3g}" if isinstance(v, float) else f"{k}={v}" for k, v in row.items()))

@@ -1,0 +1,230 @@
+"""Where the work of a recipe is done: in this process, in a pool of processes, or on a Ray cluster.
+
+An engine takes calls that depend on their arguments alone and gives their results in order, so that what comes
+out does not depend on where it was made. A worker that dies (killed, out of memory, a lost machine) is replaced
+and its calls are made again.
+"""
+
+from __future__ import annotations
+
+import itertools
+import multiprocessing
+import os
+import signal
+import threading
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import connection
+from types import TracebackType
+from typing import Any, Protocol, TypeVar
+
+Result = TypeVar("Result")
+Task = tuple[Any, ...]
+
+MAX_DEATHS = 3  # of workers over one and the same call
+
+
+class WorkerDied(ChildProcessError):
+    """A worker died whenever it made a certain call; the message names it."""
+
+
+class Engine(Protocol):
+    """Makes calls and gives their results in order; a context manager that ends its workers."""
+
+    def __enter__(self) -> Engine: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
+
+    def ordered(self, call: Callable[..., Result], tasks: Iterable[Task]) -> Generator[Result, None, None]:
+        """``call(*task)`` for each task, in order; ``tasks`` may be endless, a few are under way at a time.
+
+        Raises:
+            WorkerDied: a call that no worker survives.
+            Exception: what a call raised, when its turn comes.
+        """
+        ...
+
+
+def _describe(call: Callable[..., Any], task: Task) -> str:
+    numbers = ", ".join(str(value) for value in task if isinstance(value, int))
+    return f"{getattr(call, '__name__', 'call')}({numbers})"
+
+
+def _died(call: Callable[..., Any], task: Task) -> WorkerDied:
+    return WorkerDied(
+        f"engines: {MAX_DEATHS} workers in a row died over {_describe(call, task)} (killed, or out of memory?)"
+    )
+
+
+def _end_with_parent() -> None:
+    """In a new worker: leave interrupts to the parent, and do not outlive it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        connection.wait([parent.sentinel])
+        os._exit(1)
+
+    threading.Thread(target=watch, name="watch-parent", daemon=True).start()
+
+
+class LocalEngine:
+    """This process (``workers=1``) or a pool of spawned ones.
+
+    A script that asks for more than one needs the usual ``if __name__ == "__main__"``.
+    """
+
+    def __init__(self, workers: int, *, ahead: int | None = None) -> None:
+        _check_workers(workers)
+        self.workers = workers
+        self.ahead = 2 * workers if ahead is None else max(1, ahead)
+        self._pool: ProcessPoolExecutor | None = None
+
+    def __enter__(self) -> LocalEngine:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._end_pool()
+
+    def _end_pool(self) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(wait=True, cancel_futures=True)
+            self._pool = None
+
+    def _submit(self, call: Callable[..., Result], task: Task) -> Future[Result]:
+        if self._pool is None:
+            self._pool = ProcessPoolExecutor(
+                self.workers, mp_context=multiprocessing.get_context("spawn"), initializer=_end_with_parent
+            )
+        return self._pool.submit(call, *task)
+
+    def ordered(self, call: Callable[..., Result], tasks: Iterable[Task]) -> Generator[Result, None, None]:
+        """See :meth:`Engine.ordered`."""
+        if self.workers == 1:
+            yield from itertools.starmap(call, tasks)
+            return
+        source = iter(tasks)
+        waiting: deque[Task] = deque()
+        pending: deque[Future[Result]] = deque()  # of the first ones of `waiting`
+        deaths = 0
+        while True:
+            waiting.extend(itertools.islice(source, self.ahead - len(waiting)))
+            if not waiting:
+                return
+            try:
+                for task in itertools.islice(waiting, len(pending), self.ahead if not deaths else 1):
+                    pending.append(self._submit(call, task))
+                result = pending[0].result()
+            except BrokenProcessPool:
+                deaths += 1  # every call under way is lost; alone, the next one shows whether it is to blame
+                self._end_pool()
+                pending.clear()
+                if deaths > MAX_DEATHS:
+                    raise _died(call, waiting[0]) from None
+                continue
+            pending.popleft()
+            waiting.popleft()
+            deaths = 0
+            yield result
+
+
+class RayEngine:
+    """A Ray cluster: the one that is running (``RAY_ADDRESS``), or else one of ``workers`` processes on this machine.
+
+    Every machine of the cluster needs the same version of this package, and the same folder of meshes at the
+    same place. Ray itself makes the calls of a lost worker anew.
+    """
+
+    def __init__(self, workers: int, *, ahead: int | None = None) -> None:
+        _check_workers(workers)
+        self.workers = workers
+        self.ahead = 2 * workers if ahead is None else max(1, ahead)
+        self._started = False
+
+    def __enter__(self) -> RayEngine:
+        try:
+            import ray
+        except ImportError as error:
+            raise ImportError("engines: the engine ray needs Ray: pip install unghost[scale]") from error
+        if not ray.is_initialized():
+            try:
+                ray.init(address="auto", log_to_driver=False, logging_level="error")
+            except ConnectionError:
+                ray.init(num_cpus=self.workers, include_dashboard=False, log_to_driver=False, logging_level="error")
+            self._started = True
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._started:
+            import ray
+
+            ray.shutdown()
+            self._started = False
+
+    def ordered(self, call: Callable[..., Result], tasks: Iterable[Task]) -> Generator[Result, None, None]:
+        """See :meth:`Engine.ordered`."""
+        import ray
+        from ray.exceptions import RayTaskError, WorkerCrashedError
+
+        remote = ray.remote(call).options(num_cpus=1, max_retries=MAX_DEATHS)
+        source = iter(tasks)
+        pending: deque[tuple[Task, Any]] = deque()
+        try:
+            while True:
+                for task in itertools.islice(source, self.ahead - len(pending)):
+                    pending.append((task, remote.remote(*task)))
+                if not pending:
+                    return
+                task, reference = pending[0]
+                try:
+                    result = ray.get(reference)
+                except RayTaskError as error:
+                    raise error.cause from error
+                except WorkerCrashedError as error:
+                    raise _died(call, task) from error
+                pending.popleft()
+                yield result
+        finally:
+            for _, reference in pending:
+                ray.cancel(reference, force=True)
+
+
+ENGINES: dict[str, Callable[[int], Engine]] = {"local": LocalEngine, "ray": RayEngine}
+
+
+def _check_workers(workers: int) -> None:
+    if workers < 1:
+        raise ValueError(f"engines: workers must be >= 1, got {workers}")
+
+
+def open_engine(name: str, workers: int) -> Engine:
+    """An engine by name, to be used in a ``with``.
+
+    Args:
+        name: ``"local"`` or ``"ray"``.
+        workers: >= 1, processes at work at a time.
+
+    Raises:
+        ValueError: another name, or no workers.
+        ImportError: on entering ``"ray"`` without Ray.
+    """
+    if name not in ENGINES:
+        raise ValueError(f"open_engine: engine must be one of {', '.join(ENGINES)}, got {name!r}")
+    return ENGINES[name](workers)
+
+
+def spans(start: int, stop: int | None, length: int) -> Iterator[tuple[int, int]]:
+    """``[start, stop)`` cut into pieces of ``length``; without end if ``stop`` is None."""
+    for low in itertools.count(start, length):
+        if stop is not None and low >= stop:
+            return
+        yield low, low + length if stop is None else min(low + length, stop)

@@ -1,0 +1,244 @@
+"""PLY, text and binary, read to the letter: every element's length is accounted for before anything is made of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from .mesh_reading import Array, MeshRejected, triangulate
+
+_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
+    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
+    "double": "f8", "float64": "f8",
+}  # fmt: skip
+_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+_MOST_PROPERTIES = 256
+
+
+@dataclass
+class _Property:
+    name: str
+    dtype: str
+    length: str | None = None  # the type of a list's length
+
+
+@dataclass
+class _Element:
+    name: str
+    count: int
+    properties: list[_Property] = field(default_factory=list)
+
+    def least(self, order: str) -> int:
+        """Bytes (binary) or words (text) that ``count`` of these take at least."""
+        sizes = [np.dtype(p.length or p.dtype).itemsize if order else 1 for p in self.properties]
+        return self.count * sum(sizes)
+
+
+def _header(data: bytes) -> tuple[str, list[_Element], bytes]:
+    """Byte order ("" for text), elements, and the body."""
+    end = data.find(b"end_header")
+    if not data.startswith(b"ply") or end < 0:
+        raise MeshRejected("no PLY header")
+    body = data[end + len(b"end_header") :]
+    newline = next((mark for mark in (b"\r\n", b"\n", b"\r") if body.startswith(mark)), None)
+    if newline is None and body:
+        raise MeshRejected("the PLY header does not end with a line")
+    order: str | None = None
+    elements: list[_Element] = []
+    for line in data[:end].decode("latin-1").splitlines()[1:]:
+        words = line.split()
+        if not words or words[0] in ("comment", "obj_info"):
+            continue
+        if words[0] == "format" and len(words) == 3 and words[1] in _ORDERS and words[2] == "1.0":
+            order = _ORDERS[words[1]]
+        elif words[0] == "element" and len(words) == 3 and words[2].isdecimal():
+            elements.append(_Element(words[1], int(words[2])))
+        elif words[0] == "property" and elements and _add_property(elements[-1], words[1:]):
+            pass
+        else:
+            raise MeshRejected(f"PLY header line {line.strip()[:60]!r}")
+    if order is None or not elements:
+        raise MeshRejected("the PLY header names no format or no elements")
+    return order, elements, body[len(newline or b"") :]
+
+
+def _add_property(element: _Element, words: list[str]) -> bool:
+    """Whether the words are a property that could be added."""
+    if any(p.name == words[-1] for p in element.properties) or len(element.properties) >= _MOST_PROPERTIES:
+        return False
+    if len(words) == 2 and words[0] in _TYPES:
+        element.properties.append(_Property(words[1], _TYPES[words[0]]))
+        return True
+    if len(words) == 4 and words[0] == "list" and words[2] in _TYPES and _TYPES.get(words[1], "f")[0] in "iu":
+        element.properties.append(_Property(words[3], _TYPES[words[2]], _TYPES[words[1]]))
+        return True
+    return False
+
+
+Columns = dict[str, tuple[Array, Array | None]]  # values (lists one after the other), and the lists' lengths
+
+
+class _Words:
+    """The body of a text PLY as a stream of numbers; where its lines end does not matter."""
+
+    def __init__(self, body: bytes) -> None:
+        try:
+            if b"_" in body:
+                raise ValueError
+            self.values = np.array([float(word) for word in body.split()], dtype=np.float64)
+        except ValueError:
+            raise MeshRejected("a PLY value that is no number") from None
+        self.length, self.at = len(self.values), 0
+
+    def rest(self) -> int:
+        return self.length - self.at
+
+    def take(self, element: _Element) -> Columns:
+        """The element's columns, moving on: all rows at once where their lists are equally long, else row by row."""
+        listed = np.array([p.length is not None for p in element.properties], dtype=bool)
+        start, lengths = self.at, [self._row(listed)] if element.count and len(listed) else []
+        if lengths:
+            width = self.at - start
+            ends = np.cumsum(np.array(lengths[0]) + listed)
+            heads = (ends - lengths[0] - 1)[listed]
+            table = self.values[start : start + width * element.count]
+            if (
+                len(table) == width * element.count
+                and (table.reshape(-1, width)[:, heads] == np.array(lengths[0])[listed]).all()
+            ):
+                self.at = start + len(table)
+                lengths *= element.count
+            else:
+                lengths += [self._row(listed) for _ in range(element.count - 1)]
+        sizes = np.array(lengths, dtype=np.int64).reshape(-1, len(listed))
+        whole = sizes + listed
+        begins = (start + np.cumsum(whole) - whole.ravel()).reshape(whole.shape) + listed
+        columns: Columns = {}
+        for i, p in enumerate(element.properties):
+            n = sizes[:, i]
+            inner = np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n)
+            columns[p.name] = (self.values[np.repeat(begins[:, i], n) + inner], n if listed[i] else None)
+        return columns
+
+    def _row(self, listed: Array) -> list[int]:
+        """The lengths of one row's lists (1 for scalars), moving past it."""
+        lengths = []
+        for is_list in listed:
+            if self.at >= self.length:
+                raise MeshRejected("the PLY body ends early")
+            n = _whole(float(self.values[self.at])) if is_list else 1
+            self.at += n + bool(is_list)
+            lengths.append(n)
+        if self.at > self.length:
+            raise MeshRejected("the PLY body ends early, within a list")
+        return lengths
+
+
+def _whole(value: float) -> int:
+    if not (np.isfinite(value) and value == int(value) and value >= 0):
+        raise MeshRejected(f"a PLY list of length {value}")
+    return int(value)
+
+
+class _Bytes:
+    """The body of a binary PLY."""
+
+    def __init__(self, body: bytes, order: str) -> None:
+        self.body, self.order = body, order
+        self.length, self.at = len(body), 0
+
+    def rest(self) -> int:
+        return len(self.body[self.at :].strip(b"\r\n")) if self.length - self.at <= 2 else self.length - self.at
+
+    def take(self, element: _Element) -> Columns:
+        """The element's columns, moving on: all rows at once where their lists are equally long, else row by row."""
+        if element.count == 0 or not element.properties:
+            empty = np.zeros(0)
+            return {p.name: (empty, empty.astype(np.int64) if p.length else None) for p in element.properties}
+        start, lengths = self.at, [self._row(element)]
+        fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
+        for i, (p, n) in enumerate(zip(element.properties, lengths[0])):
+            if p.length:
+                fields += [(f"n{i}", self.order + p.length), (f"v{i}", self.order + p.dtype, (n,))]
+            else:
+                fields.append((f"v{i}", self.order + p.dtype))
+        dtype = np.dtype(fields)
+        if start + dtype.itemsize * element.count <= self.length:
+            table = np.frombuffer(self.body, dtype, element.count, start)
+            listed = [i for i, p in enumerate(element.properties) if p.length]
+            if all((table[f"n{i}"] == lengths[0][i]).all() for i in listed):
+                self.at = start + dtype.itemsize * element.count
+                return {
+                    p.name: (table[f"v{i}"].ravel(), np.full(element.count, lengths[0][i]) if p.length else None)
+                    for i, p in enumerate(element.properties)
+                }
+        lengths += [self._row(element) for _ in range(element.count - 1)]
+        return self._ragged(element, start, np.array(lengths, dtype=np.int64))
+
+    def _row(self, element: _Element) -> list[int]:
+        """The lengths of one row's lists (1 for scalars), moving past it."""
+        lengths = []
+        for p in element.properties:
+            n = 1
+            if p.length:
+                raw = self._bytes(np.dtype(p.length).itemsize)
+                n = int.from_bytes(raw, "little" if self.order == "<" else "big", signed=p.length[0] == "i")
+                _whole(n)
+            self._bytes(n * np.dtype(p.dtype).itemsize)
+            lengths.append(n)
+        return lengths
+
+    def _bytes(self, n: int) -> bytes:
+        if not 0 <= n <= self.length - self.at:
+            raise MeshRejected(f"the PLY body ends early: {n} more bytes are due, {self.length - self.at} are left")
+        self.at += n
+        return self.body[self.at - n : self.at] if n <= 8 else b""
+
+    def _ragged(self, element: _Element, start: int, lengths: Array) -> Columns:
+        """Columns of rows of unequal lists ``lengths (count, properties)``, the first row at byte ``start``."""
+        heads = np.array([np.dtype(p.length).itemsize if p.length else 0 for p in element.properties])
+        items = np.array([np.dtype(p.dtype).itemsize for p in element.properties])
+        sizes = (heads + lengths * items).ravel()
+        begins = (start + np.cumsum(sizes) - sizes).reshape(lengths.shape) + heads
+        raw = np.frombuffer(self.body, dtype=np.uint8)
+        columns: Columns = {}
+        for i, p in enumerate(element.properties):
+            n = lengths[:, i] * items[i]
+            inner = np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n)
+            values = raw[np.repeat(begins[:, i], n) + inner].view(self.order + p.dtype)
+            columns[p.name] = (values, lengths[:, i] if p.length else None)
+        return columns
+
+
+def read_ply(data: bytes) -> Array:
+    """Triangles of a PLY, text or binary of either byte order, polygons of any and of mixed lengths cut.
+
+    Raises:
+        MeshRejected: a bad header, a body shorter or longer than the header says, vertices without x, y, z, faces
+            without corners, triangle strips, or an index out of range.
+    """
+    order, elements, body = _header(data)
+    stream = _Bytes(body, order) if order else _Words(body)
+    due = sum(element.least(order) for element in elements)
+    if due > stream.length:
+        raise MeshRejected(f"the PLY header announces at least {due} values, the body has {stream.length}")
+    columns = {element.name: stream.take(element) for element in elements}
+    counts = {element.name: element.count for element in elements}
+    if counts.get("face", 0) and stream.rest():  # without faces there is nothing to get wrong
+        raise MeshRejected(f"the PLY body is {stream.rest()} values longer than its header says")
+    if len(counts) != len(elements) or counts.get("tristrips"):
+        raise MeshRejected("a PLY with triangle strips or an element twice")
+    vertex, face = columns.get("vertex"), columns.get("face", {})
+    if vertex is None or not {"x", "y", "z"} <= vertex.keys():
+        raise MeshRejected("a PLY without vertices x, y, z")
+    points = np.stack([np.asarray(vertex[axis][0], dtype=np.float64) for axis in "xyz"], axis=-1)
+    corners, lengths = face.get("vertex_indices", face.get("vertex_index", (np.zeros(0), None)))
+    if counts.get("face", 0) and lengths is None:
+        raise MeshRejected("PLY faces without a list of vertex indices")
+    if lengths is None or len(lengths) == 0:
+        return triangulate(points, np.zeros(0, np.int64), np.zeros(0, np.int64))
+    if not (np.isfinite(corners).all() and (corners == np.floor(corners)).all()):
+        raise MeshRejected("PLY vertex indices that are not whole numbers")
+    return triangulate(points, lengths, corners.astype(np.int64))

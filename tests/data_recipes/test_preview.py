@@ -1,0 +1,218 @@
+import re
+import xml.dom.minidom
+from collections import Counter
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from unghost import cli
+from unghost.core.shards import Shard, pack_labels, quantize_signed, read_shard, write_shard
+from unghost.data_recipes.curate import curate
+from unghost.data_recipes.preview import draw_pair, find_shards, sources_of, write_preview
+from unghost.data_recipes.preview_page import histogram
+from unghost.data_recipes.recipe import Recipe
+from unghost.data_recipes.render import MISSING, SURFACE
+
+VOID = {"meta", "img", "br", "link", "input", "rect", "path"}
+
+
+class Page(HTMLParser):
+    """Collects tags, addresses and text, and checks that what opens closes."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.addresses, self.open, self.said = Counter(), [], [], []
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags[tag] += 1
+        self.addresses += [value for key, value in attrs if key in ("src", "href", "action", "data", "srcset")]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.tags[tag] += 1
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.said.append(data)
+
+
+@pytest.fixture(scope="module")
+def pairs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("pairs") / "few"
+    curate(Recipe(empty_share=0.3), folder, count=9, seed=1)
+    return folder
+
+
+def shard_of(folder, signed, labels, provenance):
+    count = len(signed)
+    numbers = np.linspace(0.1, 0.9, count, dtype=np.float32)
+    packed = pack_labels(labels) if count else np.zeros((0, 8192), dtype=np.uint8)
+    write_shard(
+        folder,
+        {
+            "inputs": quantize_signed(signed),
+            "labels": packed,
+            "severity": numbers,
+            "edge_fraction": numbers,
+            "group": np.zeros(count, dtype=np.int32),
+        },
+        provenance,
+    )
+    return read_shard(folder)
+
+
+def slabs(count):
+    signed = np.full((count, 32, 32, 32), -1.0)
+    signed[:, 8:12] = 1.0
+    return signed, (signed > 0).astype(np.uint8)
+
+
+def test_the_page_holds_everything_and_asks_no_network(pairs, tmp_path):
+    path, facts = write_preview(pairs, out=tmp_path / "deep" / "page.html", cubes=4)
+    text = path.read_text(encoding="utf-8")
+    page = Page(text)
+    assert path == tmp_path / "deep" / "page.html"
+    assert not list(path.parent.glob("*.partial"))
+    assert page.tags["img"] == 2 * 4
+    assert page.tags["script"] == page.tags["link"] == 0
+    assert all(address.startswith("data:image/png;base64,") for address in page.addresses)
+    assert not re.search(r"https?:|//[a-z]|@import|url\(", re.sub(r"base64,[\w+/=]+", "", text))
+    assert facts["total"] == facts["cubes"] == 9
+    assert facts["shards"] == 1
+    said = " ".join(page.said)
+    for words in ("9 pairs of cubes", "empty inputs", "empty truths", "Edge fraction", "Occupied share", "procedural",
+                  "generated", "Sources and licences", "ghost share"):  # fmt: skip
+        assert words in said, words
+    assert page.tags["svg"] == 6
+
+
+def test_the_same_folder_gives_the_same_page(pairs, tmp_path):
+    first, _ = write_preview(pairs, out=tmp_path / "a.html", cubes=2, seed=5)
+    second, _ = write_preview(pairs, out=tmp_path / "b.html", cubes=2, seed=5)
+    assert first.read_bytes() == second.read_bytes()
+    third, _ = write_preview(pairs, out=tmp_path / "c.html", cubes=2, seed=6)
+    assert first.read_bytes() != third.read_bytes()
+
+
+def test_share_of_empty_cubes(tmp_path):
+    signed, labels = slabs(4)
+    signed[0], labels[0], labels[1] = -1.0, 0, 0
+    shard_of(tmp_path / "s", signed, labels, {"recipe": "by hand", "licence": "CC0-1.0"})
+    path, facts = write_preview(tmp_path / "s", cubes=0)
+    said = re.sub(r"<[^>]+>", " ", path.read_text(encoding="utf-8"))
+    assert path == tmp_path / "s-preview.html"
+    assert facts["empty_share"] == 0.25
+    assert re.search(r"25\s%\s+empty inputs", said)
+    assert re.search(r"50\s%\s+empty truths", said)
+    assert "CC0-1.0" in said
+
+
+def test_what_a_shard_says_of_itself_is_only_text(tmp_path):
+    signed, labels = slabs(1)
+    evil = "<script>alert(1)</script>"
+    folder = tmp_path / "a<b>&c"
+    shard_of(folder, signed, labels, {"recipe": evil, "licence": f'"{evil}'})
+    page = Page(write_preview(folder, cubes=1)[0].read_text(encoding="utf-8"))
+    assert page.tags["script"] == 0
+    assert "".join(page.said).count(evil) == 2
+    assert "a<b>&c" in "".join(page.said)
+
+
+def test_another_set_stands_beside(pairs, tmp_path):
+    signed, labels = slabs(3)
+    shard_of(tmp_path / "slabs", signed, labels, {})
+    path, facts = write_preview(pairs, out=tmp_path / "p.html", cubes=0, against=tmp_path / "slabs")
+    found = facts["against"]
+    assert 0 < found["distance"] <= 1
+    assert found["distance"] == pytest.approx(np.mean(list(found["features"].values())))
+    assert f"{found['distance']:.3f}" in path.read_text(encoding="utf-8")
+    _, same = write_preview(pairs, out=tmp_path / "p.html", cubes=0, against=pairs)
+    assert same["against"]["distance"] == pytest.approx(0, abs=1e-12)
+
+
+def test_sources_from_each_kind_of_provenance(tmp_path):
+    signed, labels = slabs(3)
+    stated = shard_of(tmp_path / "a", signed, labels, {"recipe": "harvest", "licence": "generated"})
+    assert sources_of(stated) == {("harvest", "generated"): 3}
+    recipe = {"name": "mine", "source": "meshes", "licences": ["CC0-1.0", "MIT-0"]}
+    assert sources_of(shard_of(tmp_path / "b", signed, labels, {"recipe": recipe})) == {
+        ("mine", "any of CC0-1.0, MIT-0"): 3
+    }
+    assert sources_of(shard_of(tmp_path / "c", signed, labels, {})) == {("unknown", "unknown"): 3}
+    entries = [{"path": "kit/a.glb", "licence": "CC0-1.0"}, {"path": "kit/b.glb", "licence": "CC0-1.0"}]
+    each = Shard(stated.inputs, stated.labels, stated.severity, stated.edge_fraction, stated.group,
+                 {"recipe": recipe, "sources": entries}, source=np.array([0, 1, -1], dtype=np.int32))  # fmt: skip
+    assert sources_of(each) == {("mine: kit", "CC0-1.0"): 2, ("mine", "generated"): 1}
+
+
+def test_pictures_of_a_pair_show_what_is_missing():
+    signed, labels = slabs(1)
+    whole = draw_pair(signed[0], labels[0], width=48)
+    lacking = draw_pair(np.full((32, 32, 32), -1.0), labels[0], width=48)
+
+    def near(image, color):
+        hue = np.array(color) / max(color)
+        tone = image / np.maximum(image.max(axis=-1, keepdims=True), 1)
+        return (np.abs(tone - hue).max(axis=-1) < 0.05).sum()
+
+    assert near(whole[1], SURFACE) > 150
+    assert near(whole[1], MISSING) == 0
+    assert near(lacking[1], MISSING) > 150
+
+
+def test_shards_are_found_and_unfinished_ones_are_not(tmp_path):
+    signed, labels = slabs(1)
+    for name in ("s1", "s0"):
+        shard_of(tmp_path / name, signed, labels, {})
+    (tmp_path / "s2.partial").mkdir()
+    (tmp_path / "s2.partial" / "manifest.json").write_text("{}", encoding="utf-8")
+    assert find_shards(tmp_path) == [tmp_path / "s0", tmp_path / "s1"]
+    assert find_shards(tmp_path / "s1") == [tmp_path / "s1"]
+
+
+def test_histogram_is_valid_svg_and_its_bars_are_the_shares():
+    svg = histogram({"a": np.array([1.0, 3.0]), "b": np.array([0.0, 0.0])}, np.arange(3.0), {0: "<0>", 2: "2"})
+    parsed = xml.dom.minidom.parseString(svg)
+    heights = [
+        float(bar.getAttribute("height"))
+        for bar in parsed.getElementsByTagName("rect")
+        if bar.getAttribute("height") != "10"
+    ]
+    assert heights == pytest.approx([100 / 3, 100], abs=0.1)
+    assert "75" in svg
+
+
+def test_bad_input_is_named(tmp_path):
+    with pytest.raises(ValueError, match=r"find_shards: .*absent is not a shard and holds none"):
+        write_preview(tmp_path / "absent")
+    signed, labels = slabs(0)
+    shard_of(tmp_path / "none", signed, labels, {})
+    with pytest.raises(ValueError, match="hold no cube"):
+        write_preview(tmp_path / "none")
+    with pytest.raises(ValueError, match="cubes must be >= 0 and measured >= 1, got -1 and 200"):
+        write_preview(tmp_path / "none", cubes=-1)
+    signed, labels = slabs(1)
+    shard_of(tmp_path / "cut", signed, labels, {})
+    (tmp_path / "cut" / "labels.npy").write_bytes(b"short")
+    with pytest.raises(ValueError, match="read_shard: cannot read"):
+        write_preview(tmp_path / "cut")
+    assert not list(tmp_path.glob("*.html*"))
+
+
+def test_the_verb_writes_the_page_and_says_where(tmp_path, capsys):
+    signed, labels = slabs(2)
+    shard_of(tmp_path / "s", signed, labels, {})
+    words = ["preview", str(tmp_path / "s"), "--cubes", "1", "--against", str(tmp_path / "s")]
+    assert cli.main(words) == 0
+    said = capsys.readouterr().out
+    assert "2 cubes in 1 shard, IoU of input and truth 1.000; look at " in said
+    assert "distance to" in said
+    assert (tmp_path / "s-preview.html").is_file()
+    assert cli.main(["preview", str(tmp_path / "absent")]) == 2
+    assert "unghost preview: find_shards:" in capsys.readouterr().err
