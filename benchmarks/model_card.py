@@ -22,8 +22,8 @@ unghost harvest --out out/harvest --scenes {scenes} --first 6 --seed 0 --workers
 unghost train out/procedural=.27 out/meshes=.25 out/rooms=.13 out/harvest=.35 --out out/second --seed 1 \\
   --init-from out/first.safetensors --max-seconds 3900 --batch-size 48 --learning-rate 1.2e-3 --threads 2
 unghost train out/procedural=.33 out/meshes=.32 out/rooms=.15 out/harvest=.20 --out out/third --seed {seed} \\
-  --init-from SECOND --max-seconds {seconds:.0f} --batch-size {batch_size} --learning-rate {learning_rate:g} --threads 2 \\
-  --threshold-from {threshold_from} --name unghost-m
+  --init-from SECOND --max-seconds {seconds:.0f} --batch-size {batch_size} --learning-rate {learning_rate:g} \\
+  --threads 2 --threshold-from {threshold_from} --name unghost-m
 python benchmarks/threshold.py out/third/model.safetensors"""
 START = "ca135c4"  # the commit whose weights the shipped run started from
 
@@ -69,9 +69,9 @@ def card() -> str:
         f"expect; from 800 on: any amount. The default is {manifest.default_timestep}.", "",
         *table(("file", "size", "sha256"), files), "",
         f"{manifest.parameters} parameters, {training['gflop']:.2f} GFLOP a cube. Removal threshold "
-        f"{manifest.removal_threshold:.2f}, for `clean`: the largest at which it keeps .985 of the surface of four rooms "
-        "made for that (`benchmarks/threshold.py`, docs/results/threshold.json). The default timestep was chosen for the "
-        "first model with an eye on the demo's room. DSDS decides at 0 unless told otherwise.", "",
+        f"{manifest.removal_threshold:.2f}, for `clean`: the largest at which it keeps .985 of the surface of four "
+        "rooms made for that (`benchmarks/threshold.py`, docs/results/threshold.json). The default timestep was chosen "
+        "for the first model with an eye on the demo's room. DSDS decides at 0 unless told otherwise.", "",
         "## Training", "",
         f"{training['steps']} steps of {training['batch_size']} cubes, {training['seconds'] / 60:.0f} minutes on two "
         f"CPU cores ({training['precision']}), seed {training['seed']}, commit `{training['commit']}`, torch "
