@@ -94,7 +94,8 @@ def scenes() -> tuple[Occupancy, Occupancy]:
 
 def softened(rng: np.random.Generator, clean: Occupancy, severity: float) -> Values:
     """Opacity of the soft version of the mix; the clean bits at severity 0."""
-    return opacity_from_signed(soften(rng, clean, corrupt(rng, clean, severity), severity))
+    opacity: Values = opacity_from_signed(soften(rng, clean, corrupt(rng, clean, severity), severity))
+    return opacity
 
 
 def opacity_of(name: str) -> Callable[[np.random.Generator, Occupancy, float], Values]:
@@ -108,7 +109,7 @@ def opacity_of(name: str) -> Callable[[np.random.Generator, Occupancy, float], V
 def draw(clean: Occupancy, opacity: Values, unjudged: Occupancy) -> NDArray[np.uint8]:
     """One cube: what is left grey, what came orange, what is gone blue and see-through, what is unjudged violet."""
     gone = clean & (opacity <= DEFAULT_OPACITY_THRESHOLD)
-    colors = np.where(clean[..., None], np.float32(SURFACE), np.float32(GHOST))
+    colors = np.where(clean[..., None], SURFACE, GHOST)
     colors[unjudged], colors[gone] = UNJUDGED, MISSING
     return render_cube(np.where(gone, REMOVED_OPACITY, opacity), colors, width=WIDTH)
 
@@ -166,7 +167,8 @@ def measure(name: str, cubes: list[Occupancy]) -> list[tuple[float, float]]:
 
 def clean_cubes() -> list[Occupancy]:
     """The first ``MEASURED`` cubes of the procedural recipe that hold more than 100 occupied voxels."""
-    cubes, index = [], 0
+    cubes: list[Occupancy] = []
+    index = 0
     while len(cubes) < MEASURED:
         clean = sample_cube(np.random.default_rng([SEED, index]), Recipe())[0]
         index += 1
@@ -198,7 +200,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=DOCS)
     out = parser.parse_args().out
     (out / "corruptions").mkdir(parents=True, exist_ok=True)
-    cubes, measured = clean_cubes(), {}
+    cubes, measured = clean_cubes(), dict[str, list[tuple[float, float]]]()
     for name in IMITATES:
         (out / "corruptions" / f"{name}.png").write_bytes(draw_family(name))
         measured[name] = measure(name, cubes)

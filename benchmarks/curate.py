@@ -29,7 +29,7 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
-from unghost.core.frames import RESOLUTION, CubeFrame
+from unghost.core.frames import RESOLUTION, CubeFrame, unit_lattice
 from unghost.core.results import build_results, write_results
 from unghost.data_recipes import compose
 from unghost.data_recipes.crops import choose_frame, cut_cubes, sample_mesh_cubes
@@ -112,8 +112,8 @@ def our_procedural(start: int, stop: int) -> Packed:
 def every_voxel(start: int, stop: int) -> Packed:
     """The same objects and cubes, their distance asked at every voxel."""
 
-    def plainly(distance: Any, center: Any, rotation: Any, edge: float, *, thickness: float, solid: bool) -> Occupancy:
-        values = distance(CubeFrame(center, edge, rotation).lattice().reshape(-1, 3)).reshape((RESOLUTION,) * 3)
+    def plainly(distance: Any, *, thickness: float, solid: bool) -> Occupancy:
+        values = distance(unit_lattice().reshape(-1, 3)).reshape((RESOLUTION,) * 3)
         shell = compose.shell_from_distance(values.astype(np.float32), thickness=thickness)
         return shell | (values < 0) if solid else shell
 

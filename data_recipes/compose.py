@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import signed_distance as sd
-from ..core.frames import RESOLUTION, random_rotations
+from ..core.frames import RESOLUTION, CubeFrame, random_rotations
 from .narrow_band import shell_in_cube
 from .primitives import FAMILIES, Solid, log_uniform
 from .recipe import Recipe
@@ -39,7 +39,9 @@ class Part:
 
     def distance(self, positions: Array) -> Array:
         """Signed distance ``(N,)`` at ``positions (N, 3)`` of the object."""
-        local = (self.rotation.T / self.extent) @ (positions - self.center).T  # axes first: several times as fast
+        turn = self.rotation.T / self.extent
+        local = turn @ positions.T  # axes first in memory: several times as fast
+        local -= (turn @ self.center)[:, None]
         return self.solid(local.T) * self.extent
 
 
@@ -75,6 +77,20 @@ class ComposedObject:
             if float(part.distance(center[None])[0]) <= reach:
                 kept.append(part)
         return replace(self, parts=tuple(kept))
+
+    def seen_from(self, frame: CubeFrame) -> ComposedObject:
+        """The object in a cube's own coordinates, the cube being [-1/2, 1/2]^3, distances in edges."""
+        parts = [
+            replace(
+                part,
+                center=frame.to_local(part.center),
+                rotation=frame.rotation.T @ part.rotation,
+                extent=part.extent / frame.edge_length,
+                fillet=part.fillet / frame.edge_length,
+            )
+            for part in self.parts
+        ]
+        return ComposedObject(tuple(parts), self.extent / frame.edge_length)
 
 
 def _bumpy(rng: np.random.Generator, solid: Solid) -> Solid:
@@ -261,10 +277,10 @@ def sample_cube(rng: np.random.Generator, recipe: Recipe) -> tuple[Occupancy, fl
     point, normal = surface_point(rng, composed)
     edge = fraction * composed.extent
     center = point + draw_offset(rng, recipe, normal) * edge
-    rotation = random_rotations(rng, 1)[0]
-    visible = composed.near(center, edge * _BALL_RADIUS)
+    frame = CubeFrame(center, edge, random_rotations(rng, 1)[0])
+    visible = composed.near(center, edge * _BALL_RADIUS).seen_from(frame)
     thickness, solid = float(rng.uniform(*recipe.shell_thickness)), bool(rng.random() < recipe.solid_share)
     if not visible.parts:
         return np.zeros((RESOLUTION,) * 3, dtype=bool), fraction
-    occupancy = shell_in_cube(visible.distance, center, rotation, edge, thickness=thickness, solid=solid)
+    occupancy = shell_in_cube(visible.distance, thickness=thickness, solid=solid)
     return random_dilation(rng, occupancy, recipe.max_dilation), fraction

@@ -29,8 +29,8 @@ def _in_blocks(volume: Array) -> Array:
     return np.moveaxis(split, (0, 2, 4), (0, 1, 2)).reshape(count**3, _SIDE**3, *volume.shape[3:])
 
 
-_VOXELS = np.ascontiguousarray(np.moveaxis(_in_blocks(unit_lattice()), -1, 0))  # (3, blocks, voxels), in edges
-_MIDDLES = _VOXELS.mean(axis=2)
+_MIDDLES = np.ascontiguousarray(_in_blocks(unit_lattice()).mean(axis=1).T)  # (3, blocks), in edges
+_WITHIN = np.ascontiguousarray((_in_blocks(unit_lattice())[0] - _MIDDLES[:, 0]).T)  # (3, voxels of a block)
 _PLACES = _in_blocks(np.arange(RESOLUTION**3).reshape((RESOLUTION,) * 3))  # in the cube's flat order
 _WHOLE = np.pad(np.arange(RESOLUTION**3).reshape((RESOLUTION,) * 3), 1, constant_values=-1).reshape(-1)
 _PADDED_PLACES = np.flatnonzero(_WHOLE >= 0)  # of the flat order, in the cube with one more voxel on each side
@@ -40,16 +40,12 @@ _STRIDES = np.array([_PADDED**2, _PADDED, 1])
 _STEPS = np.stack([_STRIDES, -_STRIDES])[:, :, None]
 
 
-def shell_in_cube(
-    distance: Solid, center: Array, rotation: Array, edge: float, *, thickness: float = 1.0, solid: bool = False
-) -> Occupancy:
+def shell_in_cube(distance: Solid, *, thickness: float = 1.0, solid: bool = False) -> Occupancy:
     """Voxels that a surface crosses: :func:`compose.shell_from_distance` on a cube's lattice, most of it unasked.
 
     Args:
-        distance: ``positions (N, 3) -> (N,)``, signed, 1-Lipschitz (6 percent of slack).
-        center: ``(3,)``, of the cube.
-        rotation: ``(3, 3)``, cube to world.
-        edge: > 0.
+        distance: ``positions (N, 3) -> (N,)`` in cube coordinates, the cube being [-1/2, 1/2]^3; signed, in edges,
+            1-Lipschitz (6 percent of slack). The positions' axes come first in memory, several times as fast.
         thickness: 1 marks the voxels that a plane would cross.
         solid: mark the inside too.
 
@@ -61,35 +57,30 @@ def shell_in_cube(
     """
     if not 0 < thickness < np.inf:
         raise ValueError(f"shell_in_cube: thickness must be finite and > 0, got {thickness}")
-    turn, middle = rotation * edge, np.asarray(center, dtype=np.float64)[:, None]
-
-    def ask(lattice: Array) -> Array:
-        """Distances at ``lattice (3, N)``, in edges; axes first in memory is several times as fast."""
-        return distance((turn @ lattice + middle).T)
-
-    widest = 1.5 * thickness * _SLACK * edge / RESOLUTION  # three slopes of 1, half of it on each side
-    coarse = ask(_MIDDLES)
-    reach = widest + _SLACK * edge * (_SIDE - 1) / 2 * np.sqrt(3.0) / RESOLUTION
+    widest = 1.5 * thickness * _SLACK / RESOLUTION  # three slopes of 1, half of it on each side
+    coarse = distance(_MIDDLES.T)
+    reach = widest + _SLACK * (_SIDE - 1) / 2 * np.sqrt(3.0) / RESOLUTION
     active = np.flatnonzero(np.abs(coarse) <= reach)
-    fine = ask(_VOXELS[:, active].reshape(3, -1))
+    fine = distance((_MIDDLES[:, active, None] + _WITHIN[:, None]).reshape(3, -1).T)
     places = _BLOCK_PLACES[active].reshape(-1)
     volume = np.full(_PADDED**3, np.nan, dtype=np.float32)
     volume[places] = fine
     candidates = places[np.abs(fine) <= widest]
-    beside = _beside(volume, candidates, ask)
+    beside = _beside(volume, candidates, distance)
     own = volume[candidates]
     slopes = np.fmax(np.abs(beside[0] - own), np.abs(own - beside[1])).sum(axis=0)  # fmax passes over NaN
 
     occupancy = np.zeros(RESOLUTION**3, dtype=bool)
     occupancy[_WHOLE[candidates[np.abs(own) <= 0.5 * thickness * slopes]]] = True
     if solid:
-        coarse[active] = np.inf
-        occupancy[_PLACES[coarse < 0].reshape(-1)] = True
+        inside = coarse < 0
+        inside[active] = False
+        occupancy[_PLACES[inside].reshape(-1)] = True
         occupancy[_PLACES[active].reshape(-1)[fine < 0]] = True
     return occupancy.reshape((RESOLUTION,) * 3)
 
 
-def _beside(volume: Array, places: Array, ask: Solid) -> Array:
+def _beside(volume: Array, places: Array, distance: Solid) -> Array:
     """Values after and before ``places (M,)`` along each axis, ``(2, 3, M)``; NaN beyond the cube.
 
     Where they lie in blocks left out they are asked now.
@@ -100,5 +91,5 @@ def _beside(volume: Array, places: Array, ask: Solid) -> Array:
     lattice = _WHOLE[where.reshape(-1)[unknown]]
     missing = lattice >= 0
     if missing.any():
-        values.reshape(-1)[unknown[missing]] = ask(_LATTICE[:, lattice[missing]])
+        values.reshape(-1)[unknown[missing]] = distance(_LATTICE[:, lattice[missing]].T)
     return values

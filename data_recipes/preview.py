@@ -77,7 +77,7 @@ def draw_pair(signed: NDArray[np.floating], labels: NDArray[np.uint8], *, width:
     opacity, surface = opacity_from_signed(signed), labels == SURFACE_LABEL
     turn = best_turn(opacity, (labels == FREE_LABEL) + 0.3 * surface)
     lacking = surface & (opacity <= DEFAULT_OPACITY_THRESHOLD)
-    truth = np.where(lacking[..., None], np.float32(MISSING), np.float32(SURFACE))
+    truth = np.where(lacking[..., None], MISSING, SURFACE)
     first, second = (
         render_cube(np.rot90(solid, turn), np.rot90(colors, turn), width=width)
         for solid, colors in ((opacity, _PALETTE[labels]), (surface.astype(np.float32), truth))

@@ -32,7 +32,7 @@ h2 { font-size: 21px; margin: 48px 0 10px; } p { max-width: 76ch; margin: 8px 0;
 .cubes { display: grid; grid-template-columns: repeat(auto-fill, minmax(340px, 1fr)); gap: 14px; }
 .key { max-width: none; } figure { margin: 0; }
 .cubes figure, .charts figure { background: #fff; border: 1px solid var(--line); border-radius: 8px; }
-.cubes figure, .charts figure { padding: 10px 12px; }
+.cubes figure, .charts figure { padding: 10px 12px; } .cubes figcaption { font-size: 13px; }
 .pair { display: grid; grid-template-columns: 1fr 1fr; gap: 6px; } .pair img { width: 100%; display: block; }
 .pair span { font-size: 12px; color: var(--soft); text-align: center; }
 .charts { display: grid; grid-template-columns: repeat(auto-fill, minmax(320px, 1fr)); gap: 14px; }
@@ -79,6 +79,11 @@ def _percent(share: float) -> str:
     if 0 < share < 0.0005:
         return "&lt; 0.1\u00a0%"
     return f"{100 * share:.0f}\u00a0%" if share == 0 or share >= 0.0995 else f"{100 * share:.1f}\u00a0%"
+
+
+def _edge(fraction: float) -> str:
+    digits = ".0f" if fraction >= 0.1 else ".2g"
+    return f"{100 * fraction:{digits}}\u00a0%"
 
 
 def _number(value: float | None) -> str:
@@ -133,11 +138,7 @@ def _charts(statistics: CubeStatistics, edges: Values, severities: Values) -> st
     occupied["truth"] = np.histogram(found["surface_share"], shares)[0].astype(float)
     fractions = np.geomspace(max(edges.min() * 0.999, 1e-4), max(edges.max() * 1.001, 2e-4), 21)
     middle = float(np.sqrt(fractions[0] * fractions[-1]))
-    ends = {
-        0.0: f"{100 * fractions[0]:.2g}\u00a0%",
-        10.0: f"{100 * middle:.2g}\u00a0%",
-        20.0: f"{100 * fractions[-1]:.2g}\u00a0%",
-    }
+    ends = {0.0: _edge(float(fractions[0])), 10.0: _edge(middle), 20.0: _edge(float(fractions[-1]))}
     thick = np.array([0, 1, 1.5, 2, 3, 4, 6, 8, 12, 16, 24, 33.0])
     units: dict[float, str] = {place: f"{thick[place]:g}" for place in (1, 3, 5, 7, 9)}
     opacity = statistics.opacity_histogram(25)[1:]  # the first bin is empty space
@@ -183,7 +184,7 @@ def _card(cube: DrawnCube) -> str:
     found = cube.features
     said = f"IoU {found['iou']:.2f} · {_percent(found['ghost_share'])} ghost"
     said += f" · {_percent(found['missing_share'])} missing"
-    origin = f"{html.escape(cube.shard)}, row {cube.row} · edge {100 * cube.edge_fraction:.2g}\u00a0%"
+    origin = f"{html.escape(cube.shard)}, row {cube.row} · edge {_edge(cube.edge_fraction)}"
     origin += f" · severity {cube.severity:.2f}"
     return (
         f'<figure><div class="pair">{_image(cube.seen, "input")}{_image(cube.truth, "truth")}'
@@ -246,8 +247,8 @@ second from the first.</p>
 </div>
 <p class="soft">Statistics are of {facts["cubes"]} cubes drawn at random.</p>
 <h2>{len(drawn)} of the cubes, drawn at random</h2>
-<p class="key soft">{legend}
-Below each pair: the overlap of the two, how much of the input is ghost, how much of the truth is missing.</p>
+<p class="key soft">{legend}</p>
+<p class="soft">Below each pair: the overlap of the two, how much of the input is ghost, how much of the truth is missing.</p>
 <div class="cubes">{"".join(_card(cube) for cube in drawn)}</div>
 <h2>Distributions</h2>
 <div class="charts">{_charts(statistics, edges, severities)}</div>

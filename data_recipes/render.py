@@ -177,7 +177,8 @@ def render_cube(opacity: NDArray[Any], colors: NDArray[Any], *, width: int = 168
     canvas = np.tile(np.array(PAPER, dtype=np.float32), ((width * smooth) ** 2, 1))
     canvas[view.pixels] = np.clip(picture, 0.0, 1.0)
     fine = canvas.reshape(width, smooth, width, smooth, 3).mean(axis=(1, 3))
-    return np.rint(fine * 255).astype(np.uint8)
+    image: Image = np.rint(fine * 255).astype(np.uint8)
+    return image
 
 
 def _room(opacity: Floats, view: _View) -> Floats:
@@ -185,7 +186,8 @@ def _room(opacity: Floats, view: _View) -> Floats:
     fallen = np.repeat((_light(opacity) * (1.0 - opacity))[:, :, :1], opacity.shape[2], axis=2).ravel()
     shadow = np.where(view.wall == 2, 0.72 + 0.28 * fallen[view.behind], 1.0)
     tone = _WALLS[view.wall] * shadow * (1.0 - 0.07 * view.grid)
-    return (tone[:, None] * np.array([1.0, 0.995, 0.985])).astype(np.float32)
+    colors: Floats = (tone[:, None] * np.array([1.0, 0.995, 0.985])).astype(np.float32)
+    return colors
 
 
 def best_turn(opacity: NDArray[Any], interest: NDArray[Any]) -> int:

@@ -113,7 +113,8 @@ class CubeStatistics:
         """Share of all voxels in each of ``bins`` equal bins of opacity in [0, 1]; sums to 1."""
         place = np.minimum(np.arange(LEVELS) * bins // (LEVELS - 1), bins - 1)
         counts = np.bincount(place, weights=self.levels.sum(axis=0, dtype=np.float64), minlength=bins)
-        return counts / max(counts.sum(), 1.0)
+        shares: Values = counts / max(counts.sum(), 1.0)
+        return shares
 
 
 def _contrast(opacity: NDArray[np.float32], occupied: Occupancy) -> float:

@@ -76,4 +76,5 @@ def local_thickness(occupied: Occupancy) -> Values:
     box = np.pad(occupied[low[0] : high[0], low[1] : high[1], low[2] : high[2]], 1)  # the rest cannot matter
     distance = half_lattice_distance(box).astype(np.float32)
     where = np.ravel_multi_index(tuple((2 * (filled - low + 1)).T), distance.shape)
-    return 2.0 * distance.ravel()[_summits(distance)[where]].astype(np.float64)
+    summits: Values = distance.ravel()[_summits(distance)[where]].astype(np.float64)
+    return 2.0 * summits

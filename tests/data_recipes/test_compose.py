@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from unghost.core import signed_distance as sd
-from unghost.core.frames import unit_lattice
+from unghost.core.frames import CubeFrame, random_rotations, unit_lattice
 from unghost.data_recipes.compose import (
     ComposedObject,
     Part,
@@ -117,6 +117,16 @@ def test_leaving_far_parts_out_changes_no_cube():
         np.testing.assert_array_equal(near.distance(positions) < 0, composed.distance(positions) < 0)
         fewer += len(near.parts) < len(composed.parts)
     assert fewer > 15  # else the test shows nothing
+
+
+def test_an_object_seen_from_a_cube_is_the_same_object_in_its_coordinates():
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        composed = compose_object(rng, RECIPE)
+        frame = CubeFrame(rng.normal(size=3) * 0.2, 0.07, random_rotations(rng, 1)[0])
+        positions = frame.lattice(6).reshape(-1, 3)
+        seen = composed.seen_from(frame).distance(unit_lattice(6).reshape(-1, 3))
+        np.testing.assert_allclose(seen * 0.07, composed.distance(positions), atol=1e-6)  # sines are float32
 
 
 def test_cavity_alone_is_nothing():

@@ -16,8 +16,10 @@ def twin(distance, frame, thickness, solid):
 
 
 def both(distance, frame, thickness=1.0, solid=False):
-    found = shell_in_cube(distance, frame.center, frame.rotation, frame.edge_length, thickness=thickness, solid=solid)
-    return found, twin(distance, frame, thickness, solid)
+    def seen(p):
+        return distance(p @ (frame.rotation.T * frame.edge_length) + frame.center) / frame.edge_length
+
+    return shell_in_cube(seen, thickness=thickness, solid=solid), twin(distance, frame, thickness, solid)
 
 
 @pytest.mark.parametrize("solid", [False, True])
@@ -64,17 +66,16 @@ def test_far_away_is_empty_deep_inside_is_full_and_little_is_asked():
         asked.append(len(p))
         return sd.sphere(p, radius)
 
-    place = (np.zeros(3), np.eye(3), 1.0)
-    assert not shell_in_cube(lambda p: distance(p - 3.0, 1.0), *place, solid=True).any()
-    assert not shell_in_cube(lambda p: distance(p, 9.0), *place).any()
-    assert shell_in_cube(lambda p: distance(p, 9.0), *place, solid=True).all()
+    assert not shell_in_cube(lambda p: distance(p - 3.0, 1.0), solid=True).any()
+    assert not shell_in_cube(lambda p: distance(p, 9.0)).any()
+    assert shell_in_cube(lambda p: distance(p, 9.0), solid=True).all()
     assert sum(asked) == 3 * 512
     asked.clear()
-    shell_in_cube(lambda p: distance(p, 0.4), *place)
+    shell_in_cube(lambda p: distance(p, 0.4))
     assert sum(asked) < 0.6 * 32**3
 
 
 @pytest.mark.parametrize("thickness", [0.0, np.nan, np.inf])
 def test_thickness_out_of_range_is_refused(thickness):
     with pytest.raises(ValueError, match="shell_in_cube: thickness must be finite and > 0"):
-        shell_in_cube(lambda p: p[:, 0], np.zeros(3), np.eye(3), 1.0, thickness=thickness)
+        shell_in_cube(lambda p: p[:, 0], thickness=thickness)
