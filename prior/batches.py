@@ -43,7 +43,8 @@ def _harvested(shard: Shard) -> bool:
 def scale_depth(signed: NDArray[np.float32], factor: float) -> NDArray[np.float32]:
     """Signed opacity as it were with ``factor`` times the density: ``o -> 1 - (1 - o)^factor``; -1 and +1 stay."""
     transparency = np.clip((1.0 - signed) * np.float32(0.5), 0.0, 1.0)
-    return (1.0 - 2.0 * transparency ** np.float32(factor)).astype(np.float32)
+    scaled: NDArray[np.float32] = (1.0 - 2.0 * transparency ** np.float32(factor)).astype(np.float32)
+    return scaled
 
 
 @dataclass(frozen=True)
