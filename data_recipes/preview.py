@@ -114,7 +114,7 @@ def sources_of(shard: Shard) -> Counter[tuple[str, str]]:
         made = recipe.get("source") == "procedural"
         stated = "generated" if made else "any of " + ", ".join(map(str, recipe.get("licences", ["unknown"])))
     whole = name, str(stated or "unknown")
-    rows = getattr(shard, "source", None)
+    rows = shard.source
     if rows is None:
         return Counter({whole: len(shard)})
     entries: list[dict[str, Any]] = list(provenance.get("sources", []))

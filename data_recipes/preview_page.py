@@ -248,7 +248,8 @@ second from the first.</p>
 <p class="soft">Statistics are of {facts["cubes"]} cubes drawn at random.</p>
 <h2>{len(drawn)} of the cubes, drawn at random</h2>
 <p class="key soft">{legend}</p>
-<p class="soft">Below each pair: the overlap of the two, how much of the input is ghost, how much of the truth is missing.</p>
+<p class="soft">Below each pair: the overlap of the two, how much of the input is ghost,
+how much of the truth is missing.</p>
 <div class="cubes">{"".join(_card(cube) for cube in drawn)}</div>
 <h2>Distributions</h2>
 <div class="charts">{_charts(statistics, edges, severities)}</div>
