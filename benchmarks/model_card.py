@@ -89,7 +89,8 @@ def card() -> str:
         "```",
         command,
         "```", "",
-        f"Run these at commit {DATA} (later ones draw other solids and other kinds of field). Scenes whose fit failed are given up by `unghost harvest`. The time budget makes the weights depend "
+        f"Run these at commit {DATA} (later ones draw other solids and other kinds of field). Scenes whose "
+        "fit failed are given up by `unghost harvest`. The time budget makes the weights depend "
         "on the machine's speed; the data do not. Licences: procedural "
         "solids, synthetic rooms and harvested fields are made by this project; the meshes are CC0-1.0 and MIT-0 "
         "only (KayKit, Quaternius, Kenney, AWS RoboMaker worlds), `train` split; none is in this repository.", "",
