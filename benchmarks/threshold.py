@@ -27,7 +27,7 @@ from unghost.prior.checkpoint import load_model, save_model
 from unghost.regularizer.clean import clean
 
 ROOT = Path(__file__).resolve().parents[1]
-CANDIDATES = tuple(float(value) for value in np.round(np.arange(-0.4, 0.95, 0.1), 3))
+CANDIDATES = tuple(tenth / 10 for tenth in range(-4, 10))
 
 
 @dataclass(frozen=True)
