@@ -83,13 +83,15 @@ def card() -> str:
         f"{START}:unghost/weights/MODEL_CARD.md`).", "",
         f"In harvested cubes, voxels that are opaque and true surface weigh {training['keep_weight']:g} times: a score "
         f"of 0 then means ghost at {training['keep_weight']:g} : 1. The set `capture` (cubes of a field fitted to "
-        "trajectory_1 of a real capture, labelled by one fitted to trajectories 1 and 2) was watched, not trained "
-        "on and not used for any setting of the run.", "",
+        "trajectory_1 of a real capture, labelled by one fitted to trajectories 1 and 2) was not trained on, but "
+        "looked at: it showed that labels had to count what lies behind a surface, and was watched when the second run was "
+        "stopped.", "",
         *table(("source", "shards", "cubes", "share of the stream"), sources(training["shards"])), "",
         "```",
         command,
         "```", "",
-        f"Run these at commit {DATA} (later ones draw other solids and other kinds of field). Scenes whose "
+        f"Run these at commit {DATA} (later ones draw other solids and other kinds of field); the second training ran "
+        "without the jitter of the optical depth, at the commit before. Scenes whose "
         "fit failed are given up by `unghost harvest`. The time budget makes the weights depend "
         "on the machine's speed; the data do not. Licences: procedural "
         "solids, synthetic rooms and harvested fields are made by this project; the meshes are CC0-1.0 and MIT-0 "
