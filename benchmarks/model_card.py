@@ -84,8 +84,8 @@ def card() -> str:
         f"In harvested cubes, voxels that are opaque and true surface weigh {training['keep_weight']:g} times: a score "
         f"of 0 then means ghost at {training['keep_weight']:g} : 1. The set `capture` (cubes of a field fitted to "
         "trajectory_1 of a real capture, labelled by one fitted to trajectories 1 and 2) was not trained on, but "
-        "looked at: it showed that labels had to count what lies behind a surface, and was watched when the second run was "
-        "stopped.", "",
+        "looked at: it showed that labels had to count what lies behind a surface, and was watched when the second "
+        "run was stopped.", "",
         *table(("source", "shards", "cubes", "share of the stream"), sources(training["shards"])), "",
         "```",
         command,
