@@ -172,7 +172,7 @@ def with_open3d(start: int, stop: int) -> Packed:
             open3d.utility.Vector3dVector(soup), open3d.utility.Vector3iVector(np.arange(len(soup)).reshape(-1, 3))
         )
         grid = open3d.geometry.VoxelGrid.create_from_triangle_mesh_within_bounds(mesh, 1 / RESOLUTION, -corner, corner)
-        index = np.array([voxel.grid_index for voxel in grid.get_voxels()]).reshape(-1, 3)
+        index = np.array([voxel.grid_index for voxel in grid.get_voxels()], dtype=np.int64).reshape(-1, 3)
         cube[tuple(index[((index >= 0) & (index < RESOLUTION)).all(axis=1)].T)] = True  # it goes on beyond its bounds
     return pack(cubes)
 
