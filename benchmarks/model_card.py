@@ -96,7 +96,9 @@ def card() -> str:
         "on the machine's speed; the data do not. Licences: procedural "
         "solids, synthetic rooms and harvested fields are made by this project; the meshes are CC0-1.0 and MIT-0 "
         "only (KayKit, Quaternius, Kenney, AWS RoboMaker worlds), `train` split; none is in this repository.", "",
-        "## Scores on what it has not seen", "", *table(head, scores), "",
+        "## Scores on what it has not seen", "",
+        "Ghosts removed: one threshold for all cubes of a set (docs/results/denoise.json sets one for each scene).", "",
+        *table(head, scores), "",
         "Cubes of meshes of the `test` split and, if harvested ones are listed, of scenes held out "
         "(`benchmarks/denoise.py`, docs/results/denoise.json):", "",
         *table(("set", "severity", "IoU before", "IoU after"), meshes), "",

@@ -26,7 +26,7 @@ class RegularizerSettings:
         strategy: ``"mixed"``, ``"importance"`` or ``"uniform"`` cube centres.
         uniform_share: of the mixed strategy, in [0, 1].
         timestep: for the denoiser; None for its default, or a function of the step.
-        threshold: ``x0_pred`` below it is pushed out (0: the paper); None for the manifest's ``removal_threshold``.
+        threshold: ``x0_pred`` below it is pushed out (0: the paper); None for what the manifest advises ``clean``.
         fill_threshold: ``x0_pred`` at or above it is filled; None for 0 (the paper) or ``threshold`` if higher.
         dsds_weight, visibility_weight: factors of the losses; 0 switches one off, its queries too. Under the
             opacity rule the losses are optical depths per cell, so the weights do not depend on the scene's unit.

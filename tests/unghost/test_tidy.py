@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 # Spelled in pieces, so that this file passes its own test.
 FOREIGN = re.compile(
-    r"(?<![\w.\-*])/(?:" + "|".join(["ho" + "me", "wo" + "rk", "Us" + "ers", "ro" + "ot", "tm" + "p"]) + r")/"
+    r"(?<![\w.\-])/(?:" + "|".join(["ho" + "me", "wo" + "rk", "Us" + "ers", "ro" + "ot", "tm" + "p"]) + r")/"
 )
 TEXT = {".py", ".md", ".toml", ".txt", ".json", ".cfg", ".sh", ".html", ".csv", ".yml", ".yaml", ""}
 
