@@ -1,15 +1,9 @@
-"""Cubes of meshes: reading, choosing by licence and split, cutting.
-
-Mesh files need ``trimesh`` (``pip install unghost[recipes]``); everything after reading does not.
-"""
+"""Meshes: normalised, chosen by licence and split; cubes cut from them. Files are read by :mod:`.mesh_files`."""
 
 from __future__ import annotations
 
 import csv
-import itertools
-from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +13,6 @@ from numpy.typing import NDArray
 from ..core.frames import CubeFrame
 from .box_tree import BoxTree
 from .crops import cut_cubes, sample_mesh_cubes
-from .mesh_files import load_mesh as load_mesh
 from .recipe import Recipe
 
 Array = NDArray[Any]
@@ -27,7 +20,6 @@ Occupancy = NDArray[np.bool_]
 
 MANIFEST = "manifest.csv"
 _MANIFEST_COLUMNS = ("path", "split", "licence")
-_MESH_STREAM = 0x6D657368  # keeps the order of meshes apart from the samples' own generators
 
 
 @dataclass(frozen=True)
@@ -137,47 +129,3 @@ def sample_mesh_cube(rng: np.random.Generator, mesh: Mesh, recipe: Recipe) -> tu
     """
     occupancy, (frame,) = sample_mesh_cubes([rng], mesh, recipe)
     return occupancy[0], frame, frame.edge_length
-
-
-@lru_cache(maxsize=8)
-def _cached_selection(recipe: Recipe, mesh_root: str) -> tuple[MeshEntry, ...]:
-    return tuple(select_meshes(recipe, mesh_root))
-
-
-@lru_cache(maxsize=16)
-def _cached_mesh(path: Path) -> Mesh:
-    return load_mesh(path)
-
-
-def _entry_at(recipe: Recipe, mesh_root: str, index: int, seed: int) -> MeshEntry:
-    """The mesh of a sample: runs of ``cubes_per_mesh`` share one, in an order shuffled anew each time round."""
-    entries = _cached_selection(recipe, mesh_root)
-    turn, place = divmod(index // recipe.cubes_per_mesh, len(entries))
-    order = np.random.default_rng([seed, turn, _MESH_STREAM]).permutation(len(entries))
-    return entries[int(order[place])]
-
-
-def mesh_cube_at(
-    rng: np.random.Generator, recipe: Recipe, mesh_root: str, index: int, seed: int
-) -> tuple[Occupancy, float, int]:
-    """The clean cube of sample ``index``: occupancy, edge fraction, and its mesh's row in the manifest.
-
-    ``recipe.cubes_per_mesh`` consecutive samples share a mesh; the meshes come in an order shuffled anew each
-    time all have been used.
-    """
-    return mesh_cubes_at([rng], recipe, mesh_root, [index], seed)[0]
-
-
-def mesh_cubes_at(
-    rngs: Sequence[np.random.Generator], recipe: Recipe, mesh_root: str, indices: Sequence[int], seed: int
-) -> list[tuple[Occupancy, float, int]]:
-    """:func:`mesh_cube_at` for several samples, each with its own generator; those of one mesh are cut together."""
-    found: list[tuple[Occupancy, float, int]] = []
-    entries = [_entry_at(recipe, mesh_root, index, seed) for index in indices]
-    start = 0
-    for entry, group in itertools.groupby(entries):
-        stop = start + len(list(group))
-        occupancy, frames = sample_mesh_cubes(rngs[start:stop], _cached_mesh(entry.path), recipe)
-        found += [(cube, frame.edge_length, entry.row) for cube, frame in zip(occupancy, frames)]
-        start = stop
-    return found

@@ -6,7 +6,8 @@ import pytest
 
 from unghost.core.frames import CubeFrame, random_rotations
 from unghost.data_recipes.crops import choose_frame, cut_cubes, sample_mesh_cubes
-from unghost.data_recipes.meshes import Mesh, load_mesh, select_meshes
+from unghost.data_recipes.mesh_files import load_mesh
+from unghost.data_recipes.meshes import Mesh, select_meshes
 from unghost.data_recipes.recipe import load_recipe
 from unghost.data_recipes.voxelize import voxelize_triangles, voxelize_triangles_slowly
 

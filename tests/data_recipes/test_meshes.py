@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from unghost.core.frames import CubeFrame
-from unghost.data_recipes.meshes import Mesh, load_mesh, mesh_cube_at, sample_mesh_cube, select_meshes
+from unghost.data_recipes.mesh_files import load_mesh
+from unghost.data_recipes.mesh_sources import MeshLibrary
+from unghost.data_recipes.meshes import Mesh, sample_mesh_cube, select_meshes
 from unghost.data_recipes.recipe import load_recipe
 from unghost.data_recipes.voxelize import voxelize_triangles
 
@@ -125,7 +127,7 @@ def test_missing_trimesh_names_the_extra(tmp_path):
     (tmp_path / "a.ply").write_bytes(b"ply\n")
     code = (
         "import sys; sys.modules['trimesh'] = None\n"
-        "from unghost.data_recipes.meshes import load_mesh\n"
+        "from unghost.data_recipes.mesh_files import load_mesh\n"
         f"load_mesh({str(tmp_path / 'a.ply')!r})"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
@@ -154,8 +156,11 @@ def test_bad_manifests(mesh_root, tmp_path_factory):
 
 def test_samples_share_meshes_in_runs_and_every_mesh_has_its_turn(mesh_root):
     recipe = dataclasses.replace(RECIPE, cubes_per_mesh=3)
-    groups = [mesh_cube_at(np.random.default_rng([0, i]), recipe, str(mesh_root), i, 0)[2] for i in range(12)]
-    runs = np.array(groups).reshape(4, 3)
+    library = MeshLibrary(recipe, mesh_root)
+    cubes, passed = library.draw([np.random.default_rng([0, i]) for i in range(12)], range(12), seed=0)
+    library.close()
+    assert not passed
+    runs = np.array([cube.row for cube in cubes]).reshape(4, 3)
     assert (runs == runs[:, :1]).all()
     assert sorted(runs[:2, 0]) == sorted(runs[2:, 0]) == [0, 3]
 
