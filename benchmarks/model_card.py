@@ -39,13 +39,31 @@ def sources(shards: Iterable[dict[str, Any]]) -> list[list[str]]:
     return [[name, f"{n}", f"{cubes}", f"{weight / whole:.2f}"] for name, (n, cubes, weight) in total.items()]
 
 
+def history(training: dict[str, Any]) -> list[str]:
+    """How long, from what weights, and what was looked at."""
+    second = training["started_from"]
+    first = second["started_from"]
+    return [
+        f"{training['steps']} steps of {training['batch_size']} cubes, {training['seconds'] / 60:.0f} minutes on two "
+        f"CPU cores ({training['precision']}), seed {training['seed']}, commit `{training['commit']}`, torch "
+        f"{training['torch']}. It started from the averaged weights of a run of {second['seconds'] / 60:.0f} minutes "
+        f"({second['steps']} steps; stopped before its time and taken out of its state file by hand: it had begun to "
+        f"know the harvested scenes by heart), and that one from an earlier model of ours: {first['steps']} steps, "
+        f"{first['seconds'] / 60:.0f} minutes, sha256 `{first['sha256']}` (its card: `git show "
+        f"{START}:unghost/weights/MODEL_CARD.md`).", "",
+        f"In harvested cubes, voxels that are opaque and true surface weigh {training['keep_weight']:g} times: a score "
+        f"of 0 then means ghost at {training['keep_weight']:g} : 1. The set `capture` (cubes of a field fitted to "
+        "trajectory_1 of a real capture, labelled by one fitted to trajectories 1 and 2) was not trained on, but "
+        "looked at: it showed that labels had to count what lies behind a surface, and was watched when the second "
+        "run was stopped.", "",
+    ]  # fmt: skip
+
+
 def card() -> str:
     manifest = read_manifest(WEIGHTS / "default.onnx")
     training = manifest.training
     harvested = [shard["name"] for shard in training["shards"] if shard["source"] == "harvest"]
     counts = {name: int(cubes) for name, _, cubes, _ in sources(training["shards"])}
-    second = training["started_from"]
-    first = second["started_from"]
     command = COMMANDS.format(
         start=START, scenes=int(max(harvested).removeprefix("scene-")) - 5, **{**training, **counts}
     )  # fmt: skip
@@ -74,18 +92,7 @@ def card() -> str:
         "rooms made for that (`benchmarks/threshold.py`, docs/results/threshold.json). The default timestep was chosen "
         "for the first model with an eye on the demo's room. DSDS decides at 0 unless told otherwise.", "",
         "## Training", "",
-        f"{training['steps']} steps of {training['batch_size']} cubes, {training['seconds'] / 60:.0f} minutes on two "
-        f"CPU cores ({training['precision']}), seed {training['seed']}, commit `{training['commit']}`, torch "
-        f"{training['torch']}. It started from the averaged weights of a run of {second['seconds'] / 60:.0f} minutes "
-        f"({second['steps']} steps; stopped before its time and taken out of its state file by hand: it had begun to "
-        f"know the harvested scenes by heart), and that one from an earlier model of ours: {first['steps']} steps, "
-        f"{first['seconds'] / 60:.0f} minutes, sha256 `{first['sha256']}` (its card: `git show "
-        f"{START}:unghost/weights/MODEL_CARD.md`).", "",
-        f"In harvested cubes, voxels that are opaque and true surface weigh {training['keep_weight']:g} times: a score "
-        f"of 0 then means ghost at {training['keep_weight']:g} : 1. The set `capture` (cubes of a field fitted to "
-        "trajectory_1 of a real capture, labelled by one fitted to trajectories 1 and 2) was not trained on, but "
-        "looked at: it showed that labels had to count what lies behind a surface, and was watched when the second "
-        "run was stopped.", "",
+        *history(training),
         *table(("source", "shards", "cubes", "share of the stream"), sources(training["shards"])), "",
         "```",
         command,

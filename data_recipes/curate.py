@@ -127,12 +127,7 @@ def curate(
         >>> from unghost.data_recipes.recipe import load_recipe
         >>> shards = curate(load_recipe("procedural"), "pairs", count=20000, seed=0, workers=2)  # doctest: +SKIP
     """
-    numbers = (("count", count, 1), ("seed", seed, 0), ("workers", workers, 1), ("shard_length", shard_length, 1))
-    for name, value, least in numbers:
-        if value < least:
-            raise ValueError(f"curate: {name} must be >= {least}, got {value}")
-    if count > MAX_COUNT:
-        raise ValueError(f"curate: count must be <= {MAX_COUNT}, got {count}")
+    _check_numbers(count=(count, 1), seed=(seed, 0), workers=(workers, 1), shard_length=(shard_length, 1))
     opened, root = open_engine(engine, workers), checked_root(recipe, mesh_root)
     plans = _plans(recipe, Path(out), count, seed, root, shard_length)
     found = [plan.finished() for plan in plans]
@@ -145,20 +140,37 @@ def curate(
         with opened, tqdm(total=count, initial=count - left, unit="cube", disable=not progress, smoothing=0.05) as bar:
             chunks = opened.ordered(make_chunk, tasks)
             try:
-                for plan in todo:
-                    made.append(plan.write(chunks, bar))
-            except WorkerDied:
-                raise
-            except OSError as error:
-                stay = f"{len(plans) - len(todo) + len(made)} of {len(plans)} shards are finished and stay"
-                message = f"curate: {error.strerror or error}; {stay}: the same call goes on from there"
-                raise OSError(error.errno, message) from error
+                _write(todo, chunks, bar, made, wanted=len(plans))
             finally:
                 chunks.close()
                 close_meshes(root)
     if log is not None:
         _report(log, [provenance for provenance in (*found, *made) if provenance is not None])
     return [plan.folder for plan in plans]
+
+
+def _check_numbers(**numbers: tuple[int, int]) -> None:
+    """Each is a value and the least it may be; ``count`` has a most as well."""
+    for name, (value, least) in numbers.items():
+        if value < least:
+            raise ValueError(f"curate: {name} must be >= {least}, got {value}")
+    if numbers["count"][0] > MAX_COUNT:
+        raise ValueError(f"curate: count must be <= {MAX_COUNT}, got {numbers['count'][0]}")
+
+
+def _write(
+    todo: Sequence[_Plan], chunks: Iterator[Chunk], bar: tqdm[Any], made: list[dict[str, Any]], *, wanted: int
+) -> None:
+    """Write the shards of ``todo`` in order, their provenance to ``made``; a full disk says what stays."""
+    try:
+        for plan in todo:
+            made.append(plan.write(chunks, bar))
+    except WorkerDied:
+        raise
+    except OSError as error:
+        stay = f"{wanted - len(todo) + len(made)} of {wanted} shards are finished and stay"
+        message = f"curate: {error.strerror or error}; {stay}: the same call goes on from there"
+        raise OSError(error.errno, message) from error
 
 
 def _report(log: Callable[[str], None], shards: Sequence[dict[str, Any]]) -> None:

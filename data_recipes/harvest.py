@@ -12,7 +12,6 @@ import os
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,6 +30,7 @@ from ..core.shards import (
     unpack_labels,
     write_shard,
 )
+from .harvest_config import HarvestConfig
 from .harvest_context import count_views, signed_opacity, surroundings
 from .harvest_labels import Truth, check_fit, severity_of
 
@@ -38,59 +38,8 @@ if TYPE_CHECKING:
     from ..fields.kinds import TrainableField
     from ..fields.scenes import PhotographedScene
 
-KINDS = ("dense", "hash", "mlp")  # of field, as fields.kinds has them
-HELD_OUT_KINDS = ("mlp",)  # never in a harvest for training
 EARLY = 0.45  # share of the fit at which the first cubes are taken
 TOGETHER, QUERY = 8, 1 << 17  # cubes, and points in them, that are worked on at a time
-
-
-@dataclass(frozen=True)
-class HarvestConfig:
-    """What a harvest varies, each value drawn per scene.
-
-    Attributes:
-        kinds, shares: kinds of field, and how often each is drawn (relative to their sum). A frequency-encoded
-            ``mlp`` is left out by default: it is there to be harvested for evaluation.
-        resolutions: cells along an axis of the contracted cube (of the finest level, of half the shortest wavelength).
-        photos, photo_width: how many photos a field sees, and their width in pixels (4:3).
-        steps: fitting steps, log-uniform; cubes are also taken after ``EARLY`` of them.
-        rays: rays a step.
-        cubes: cubes per snapshot (two snapshots a scene).
-        voxel_pitch: voxel side in field cells, log-uniform.
-        rotated_share: share of cubes with a random rotation.
-        room_pitch: voxel side of :func:`room_scene`'s cubes, scene units, log-uniform.
-        fewest_opaque, most_ghosts: a fit has failed, and its scene is given up, if a smaller share of the surface is
-            opaque, or a larger share of what is opaque are ghosts.
-    """
-
-    kinds: tuple[str, ...] = ("dense", "hash")
-    shares: tuple[float, ...] = (0.5, 0.5)
-    resolutions: tuple[int, ...] = (64, 80, 96, 112, 128, 160)
-    photos: tuple[int, int] = (12, 32)
-    photo_width: tuple[int, int] = (80, 128)
-    steps: tuple[int, int] = (250, 900)
-    rays: int = 1152
-    cubes: int = 144
-    voxel_pitch: tuple[float, float] = (0.5, 2.0)
-    rotated_share: float = 0.5
-    room_pitch: tuple[float, float] = (0.008, 0.05)
-    fewest_opaque: float = 0.1
-    most_ghosts: float = 0.9
-
-    def __post_init__(self) -> None:
-        unknown = sorted(set(self.kinds) - set(KINDS))
-        if unknown or not self.kinds or len(set(self.kinds)) < len(self.kinds):
-            raise ValueError(f"HarvestConfig: kinds must be different ones of {', '.join(KINDS)}, got {self.kinds}")
-        if len(self.shares) != len(self.kinds) or not all(0 < share < np.inf for share in self.shares):
-            raise ValueError(
-                f"HarvestConfig: shares must be one finite number > 0 for each of {self.kinds}, got {self.shares}"
-            )
-        for name in ("photos", "photo_width", "steps", "voxel_pitch", "room_pitch"):
-            low, high = getattr(self, name)
-            if not 0 < low <= high:
-                raise ValueError(f"HarvestConfig: {name} must be (low, high) with 0 < low <= high, got {(low, high)}")
-        if min(self.rays, self.cubes) < 1:
-            raise ValueError(f"HarvestConfig: rays and cubes must be >= 1, got {self.rays} and {self.cubes}")
 
 
 def _density_fn(field: TrainableField) -> Callable[[NDArray[Any]], NDArray[np.float32]]:

@@ -111,14 +111,15 @@ def _set_stage(field: TrainableField, stages: tuple[tuple[float, float], ...], d
     return field.refine(max((stage for stage in stages if stage[0] <= done), key=lambda stage: stage[0])[1])
 
 
-def _render_batch(
+def _batch_loss(
     field: TrainableField,
     pixels: tuple[Tensor, Tensor, Tensor],
     config: TrainingConfig,
     generator: torch.Generator,
     occupied: Tensor | None,
-) -> tuple[Rendering, Tensor]:
-    """Random rays rendered before random backgrounds, and their mean squared error."""
+    observer: Observer | None,
+) -> tuple[Tensor, Tensor]:
+    """Random rays rendered before random backgrounds: their mean squared error, and that with the distortion loss."""
     origins, directions, colors = pixels
     batch = torch.randint(len(origins), (config.rays,), generator=generator)
     rendering = render_rays(
@@ -126,7 +127,10 @@ def _render_batch(
     )
     background = torch.rand(config.rays, 3, generator=generator)
     rgb = rendering.rgb + (1.0 - rendering.accumulation[:, None]) * background
-    return rendering, torch.nn.functional.mse_loss(rgb, colors[batch])
+    if observer is not None:
+        observer(rendering.positions.reshape(-1, 3), rendering.density.detach().reshape(-1))
+    photometric = torch.nn.functional.mse_loss(rgb, colors[batch])
+    return photometric, photometric + config.distortion_weight * distortion_loss(rendering).mean()
 
 
 def train_field(
@@ -179,10 +183,7 @@ def train_field(
         if step % 16 == 0 or resampled:
             skipping = fine_tune or share >= config.skip_from
             occupied = field.occupied_nodes(config.skip_below) if skipping else None
-        rendering, photometric = _render_batch(field, pixels, config, generator, occupied)
-        loss = photometric + config.distortion_weight * distortion_loss(rendering).mean()
-        if observer is not None:
-            observer(rendering.positions.reshape(-1, 3), rendering.density.detach().reshape(-1))
+        photometric, loss = _batch_loss(field, pixels, config, generator, occupied, observer)
         if regularizer is not None and (extra := regularizer(field, step)) is not None:
             loss = loss + extra
         errors.append(float(photometric.detach()))

@@ -56,8 +56,8 @@ def harvest(
         kinds: of field, NAME or NAME=SHARE: dense, hash, mlp; dense and hash if not given. mlp is meant to be
             held out: harvest it apart, with another seed, for evaluation.
     """
-    from .data_recipes.harvest import HarvestConfig
     from .data_recipes.harvest import harvest as make
+    from .data_recipes.harvest_config import HarvestConfig
 
     given: dict[str, Any] = {} if cubes is None else {"cubes": cubes}
     if kinds:

@@ -9,7 +9,9 @@ from unghost.core.frames import cube_lattices
 from unghost.core.occupancy import FREE_LABEL, IGNORE_LABEL, opacity_from_density
 from unghost.core.shards import dequantize_signed, read_shard, unpack_frame, unpack_labels
 from unghost.data_recipes import harvest as module
-from unghost.data_recipes.harvest import HarvestConfig, harvest, harvest_scene, room_scene
+from unghost.data_recipes import harvest_config
+from unghost.data_recipes.harvest import harvest, harvest_scene, room_scene
+from unghost.data_recipes.harvest_config import HarvestConfig
 from unghost.data_recipes.harvest_context import count_views
 from unghost.data_recipes.harvest_labels import Truth, severity_of
 
@@ -134,7 +136,7 @@ def check_opacity(field, lattice, opacity, pool):
     assert opacity.max() > 0.1
 
 
-@pytest.mark.parametrize("kind", module.KINDS)
+@pytest.mark.parametrize("kind", harvest_config.KINDS)
 def test_any_kind_of_field_is_harvested(kind, tmp_path):
     config = replace(TINY, kinds=(kind,), shares=(1.0,), steps=(5, 6), cubes=1)
     assert harvest(tmp_path, scenes=1, seed=3, first=5, config=config) == 2 * config.cubes
@@ -157,9 +159,9 @@ def test_any_kind_of_field_is_harvested(kind, tmp_path):
 def test_kinds_come_in_their_shares_in_the_same_rooms():
     from unghost.fields.kinds import KINDS
 
-    assert set(module.KINDS) == set(KINDS)
-    assert not set(HarvestConfig().kinds) & set(module.HELD_OUT_KINDS)
-    assert set(HarvestConfig().kinds) | set(module.HELD_OUT_KINDS) == set(KINDS)
+    assert set(harvest_config.KINDS) == set(KINDS)
+    assert not set(HarvestConfig().kinds) & set(harvest_config.HELD_OUT_KINDS)
+    assert set(HarvestConfig().kinds) | set(harvest_config.HELD_OUT_KINDS) == set(KINDS)
     assert module.HarvestConfig().shares == (0.5, 0.5)
     config = replace(TINY, kinds=("dense", "hash"), shares=(1.0, 3.0))
     drawn = [module._draw_field(np.random.default_rng([1, index]), config)[0] for index in range(400)]
