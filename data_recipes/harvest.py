@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -35,9 +35,11 @@ from .harvest_context import count_views, signed_opacity, surroundings
 from .harvest_labels import Truth, check_fit, severity_of
 
 if TYPE_CHECKING:
+    from ..core.sampled_distance import SampledDistance
     from ..fields.kinds import TrainableField
     from ..fields.scenes import PhotographedScene
 
+OBJECT_STREAM = 0x6F626A  # keeps the choice of meshes apart from a scene's own generator
 EARLY = 0.45  # share of the fit at which the first cubes are taken
 TOGETHER, QUERY = 8, 1 << 17  # cubes, and points in them, that are worked on at a time
 
@@ -101,12 +103,26 @@ def harvest_cubes(
     return arrays
 
 
-def _photograph(rng: np.random.Generator, config: HarvestConfig) -> PhotographedScene:
+def _photograph(
+    rng: np.random.Generator, config: HarvestConfig, objects: Sequence[SampledDistance] = ()
+) -> PhotographedScene:
     from ..fields.scenes import photograph, random_scene
 
     width = int(rng.integers(config.photo_width[0], config.photo_width[1] + 1))
     photos = int(rng.integers(config.photos[0], config.photos[1] + 1))
-    return photograph(rng, random_scene(rng), count=photos, width=width, height=width * 3 // 4)
+    return photograph(rng, random_scene(rng, objects), count=photos, width=width, height=width * 3 // 4)
+
+
+def _draw_objects(
+    seed: int, index: int, config: HarvestConfig, mesh_root: str | Path | None
+) -> tuple[list[SampledDistance], list[dict[str, Any]]]:
+    """The meshes of a scene, drawn apart from all else; none without a folder."""
+    if mesh_root is None:
+        return [], []
+    from .mesh_objects import draw_objects
+
+    rng = np.random.default_rng([seed, index, OBJECT_STREAM])
+    return draw_objects(rng, mesh_root, int(rng.integers(config.objects[0], config.objects[1] + 1)))
 
 
 def _draw_field(rng: np.random.Generator, config: HarvestConfig) -> tuple[str, int, TrainableField]:
@@ -120,16 +136,20 @@ def _draw_field(rng: np.random.Generator, config: HarvestConfig) -> tuple[str, i
     return kind, resolution, make_field(kind, resolution, initial_opacity=opacity, seed=int(rng.integers(2**31)))
 
 
-def harvest_scene(seed: int, index: int, config: HarvestConfig) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+def harvest_scene(
+    seed: int, index: int, config: HarvestConfig, mesh_root: str | Path | None = None
+) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """Build, photograph, fit and cut scene ``index``: shard arrays and provenance. Depends on (seed, index) alone.
 
     Scene ``index`` is the same room in the same photos whatever the kinds: a set that is held out needs its own seed.
+    With a folder of meshes, some of its ``train`` split stand among the furniture (:mod:`.mesh_objects`).
     """
     from ..fields.rendering import Sampling
     from ..fields.training import TrainingConfig, train_field
 
     rng = np.random.default_rng([seed, index])
-    photographed = _photograph(rng, config)
+    objects, meshes = _draw_objects(seed, index, config, mesh_root)
+    photographed = _photograph(rng, config, objects)
     kind, resolution, field = _draw_field(rng, config)
     steps = int(np.exp(rng.uniform(*np.log(config.steps))))
     samples = max(48, round(2.4 / field.field_pitch))
@@ -159,12 +179,15 @@ def harvest_scene(seed: int, index: int, config: HarvestConfig) -> tuple[dict[st
     provenance = {
         "recipe": "harvest", "seed": seed, "scene": index, "photos": photos, "photo_width": width, "steps": steps,
         "field": kind, "resolution": resolution, "field_pitch": field.field_pitch,
-        "psnr": round(float(report["psnr"]), 3), "config": dataclasses.asdict(config), "licence": "generated",
+        "psnr": round(float(report["psnr"]), 3), "config": dataclasses.asdict(config),
+        "licence": " AND ".join(sorted({"generated", *(mesh["licence"] for mesh in meshes)})), "meshes": meshes,
     }  # fmt: skip
     return arrays, provenance
 
 
-def room_scene(seed: int, index: int, config: HarvestConfig) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+def room_scene(
+    seed: int, index: int, config: HarvestConfig, mesh_root: str | Path | None = None
+) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """Cubes of scene ``index`` as a perfect field would show them, with synthetic corruption; nothing is fitted.
 
     Whole rooms at the pitch of a field's cells: several things in a cube, thin legs, walls.
@@ -175,7 +198,8 @@ def room_scene(seed: int, index: int, config: HarvestConfig) -> tuple[dict[str, 
     from .recipe import load_recipe
 
     rng, recipe = np.random.default_rng([seed, index, 1]), load_recipe("rooms")
-    scene, aabb = random_scene(rng), np.array([[-1.0] * 3, [1.0] * 3])
+    objects, meshes = _draw_objects(seed, index, config, mesh_root)
+    scene, aabb = random_scene(rng, objects), np.array([[-1.0] * 3, [1.0] * 3])
     count = config.cubes
     low, high = np.log(config.room_pitch)
     edges = RESOLUTION * np.exp(rng.uniform(low, high, size=count))
@@ -199,16 +223,19 @@ def room_scene(seed: int, index: int, config: HarvestConfig) -> tuple[dict[str, 
         "group": np.full(count, index, dtype=np.int32),
     }
     provenance: dict[str, Any] = {"recipe": "rooms", "seed": seed, "scene": index, "config": dataclasses.asdict(config)}
-    return arrays, provenance | {"licence": "generated"}
+    licences = sorted({"generated", *(mesh["licence"] for mesh in meshes)})
+    return arrays, provenance | {"licence": " AND ".join(licences), "meshes": meshes}
 
 
-def _work(folder: str, seed: int, index: int, config: HarvestConfig, fit: bool) -> tuple[int, str]:
+def _work(
+    folder: str, seed: int, index: int, config: HarvestConfig, fit: bool, mesh_root: str | None
+) -> tuple[int, str]:
     try:
         if fit:
             import torch
 
             torch.set_num_threads(1)
-        arrays, provenance = (harvest_scene if fit else room_scene)(seed, index, config)
+        arrays, provenance = (harvest_scene if fit else room_scene)(seed, index, config, mesh_root)
     except (RuntimeError, FloatingPointError) as error:  # no free path, a failed fit: reported, not fatal
         return index, str(error)
     write_shard(Path(folder) / f"scene-{index:05d}", arrays, provenance)
@@ -224,6 +251,7 @@ def harvest(
     workers: int = 1,
     config: HarvestConfig | None = None,
     fit: bool = True,
+    mesh_root: str | Path | None = None,
     progress: bool = False,
     log: Callable[[str], None] | None = None,
 ) -> int:
@@ -231,6 +259,7 @@ def harvest(
 
     A run can be killed at any time and started again. Without ``fit``, cubes are of perfect fields with synthetic
     corruption (:func:`room_scene`): quick, and needs no torch. ``log`` hears of scenes that were given up.
+    ``mesh_root`` is a folder of meshes with its manifest, for objects beside the procedural ones.
 
     Returns:
         The number of pairs now in ``out``.
@@ -244,12 +273,13 @@ def harvest(
     todo = [index for index in range(first, first + scenes) if not (folder / f"scene-{index:05d}").exists()]
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     started = time.perf_counter()
+    root = None if mesh_root is None else str(mesh_root)
     with (
         ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool,
         tqdm(total=len(todo), disable=not progress, unit="scene") as bar,
     ):
         for index, problem in (
-            pool.map(_work, *zip(*((str(folder), seed, index, config, fit) for index in todo))) if todo else ()
+            pool.map(_work, *zip(*((str(folder), seed, index, config, fit, root) for index in todo))) if todo else ()
         ):
             if problem and log is not None:
                 log(f"scene {index}: {problem}")

@@ -21,6 +21,7 @@ class HarvestConfig:
         photos, photo_width: how many photos a field sees, and their width in pixels (4:3).
         steps: fitting steps, log-uniform; cubes are also taken after ``EARLY`` of them.
         rays: rays a step.
+        objects: how many meshes stand in a scene, where there is a folder of them.
         cubes: cubes per snapshot (two snapshots a scene).
         voxel_pitch: voxel side in field cells, log-uniform.
         rotated_share: share of cubes with a random rotation.
@@ -30,13 +31,14 @@ class HarvestConfig:
     """
 
     kinds: tuple[str, ...] = ("dense", "hash")
-    shares: tuple[float, ...] = (0.5, 0.5)
+    shares: tuple[float, ...] = (0.6, 0.4)
     resolutions: tuple[int, ...] = (64, 80, 96, 112, 128, 160)
     photos: tuple[int, int] = (12, 32)
     photo_width: tuple[int, int] = (80, 128)
     steps: tuple[int, int] = (250, 900)
     rays: int = 1152
-    cubes: int = 144
+    objects: tuple[int, int] = (0, 5)
+    cubes: int = 168
     voxel_pitch: tuple[float, float] = (0.5, 2.0)
     rotated_share: float = 0.5
     room_pitch: tuple[float, float] = (0.008, 0.05)
@@ -55,5 +57,7 @@ class HarvestConfig:
             low, high = getattr(self, name)
             if not 0 < low <= high:
                 raise ValueError(f"HarvestConfig: {name} must be (low, high) with 0 < low <= high, got {(low, high)}")
+        if not 0 <= self.objects[0] <= self.objects[1]:
+            raise ValueError(f"HarvestConfig: objects must be (low, high) with 0 <= low <= high, got {self.objects}")
         if min(self.rays, self.cubes) < 1:
             raise ValueError(f"HarvestConfig: rays and cubes must be >= 1, got {self.rays} and {self.cubes}")

@@ -120,6 +120,17 @@ class MeshLibrary:
         first = self.rejected[passed[0]]
         raise ValueError(f"curate: none of the {len(passed)} meshes is usable; of {first['path']}: {first['reason']}")
 
+    def mesh(self, place: int, *, seed: int = 0) -> tuple[MeshEntry, Mesh]:
+        """The mesh at ``place >= 0`` of the shuffled order, or the next one after it that is usable.
+
+        Raises:
+            ValueError: no mesh is usable.
+        """
+        entry, _ = self._usable(place * self.recipe.cubes_per_mesh, seed)
+        mesh = self._load(entry)
+        assert mesh is not None  # it was usable a moment ago
+        return entry, mesh
+
     def draw(
         self, rngs: Sequence[np.random.Generator], indices: Sequence[int], *, seed: int
     ) -> tuple[list[MeshCube], set[int]]:

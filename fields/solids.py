@@ -24,6 +24,7 @@ SHAPES: dict[str, Callable[..., Array]] = {
     "torus": sd.torus,
     "cone": sd.cone,
     "polyline_tube": sd.polyline_tube,
+    "sampled": lambda positions, distance: distance(positions),  # a SampledDistance
 }
 
 

@@ -39,7 +39,7 @@ def curate(
 
 def harvest(
     out: Path, scenes: int = 16, seed: int = 0, first: int = 0, workers: int = 1, fit: bool = True,
-    cubes: int | None = None, kinds: tuple[str, ...] = (),
+    cubes: int | None = None, kinds: tuple[str, ...] = (), mesh_root: Path | None = None,
 ) -> None:  # fmt: skip
     """Fit radiance fields to few photos of synthetic scenes; cut out cubes beside the truth.
 
@@ -55,6 +55,7 @@ def harvest(
         cubes: per scene (and snapshot of its field); the default of HarvestConfig if not given.
         kinds: of field, NAME or NAME=SHARE: dense, hash, mlp; dense and hash if not given. mlp is meant to be
             held out: harvest it apart, with another seed, for evaluation.
+        mesh_root: a folder of meshes with its manifest.csv; some of its train split stand in the scenes then.
     """
     from .data_recipes.harvest import harvest as make
     from .data_recipes.harvest_config import HarvestConfig
@@ -64,8 +65,9 @@ def harvest(
         given["kinds"], given["shares"] = zip(*map(_named_share, kinds))
     config = HarvestConfig(**given)
     pairs = make(
-        out, scenes=scenes, seed=seed, first=first, workers=workers, config=config, fit=fit, progress=True, log=print
-    )
+        out, scenes=scenes, seed=seed, first=first, workers=workers, config=config, fit=fit, mesh_root=mesh_root,
+        progress=True, log=print,
+    )  # fmt: skip
     print(f"{pairs} pairs under {out}")
 
 

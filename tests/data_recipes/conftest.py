@@ -8,10 +8,10 @@ from unghost.core.cameras import Cameras
 def photographed():
     """A ball and a box on a floor, photographed from +x: their -x sides are seen by nobody."""
     pytest.importorskip("torch")
-    from unghost.fields import scenes, solids
+    from unghost.fields import furniture, scenes, solids
 
     rng = np.random.default_rng(0)
-    texture = scenes.random_texture(rng)
+    texture = furniture.random_texture(rng)
     scene = solids.SolidScene(
         [
             solids.Solid("sphere", (0.3,), np.array([0.2, 0.3, -0.1]), texture, 0.3),

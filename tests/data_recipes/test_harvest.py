@@ -162,7 +162,7 @@ def test_kinds_come_in_their_shares_in_the_same_rooms():
     assert set(harvest_config.KINDS) == set(KINDS)
     assert not set(HarvestConfig().kinds) & set(harvest_config.HELD_OUT_KINDS)
     assert set(HarvestConfig().kinds) | set(harvest_config.HELD_OUT_KINDS) == set(KINDS)
-    assert module.HarvestConfig().shares == (0.5, 0.5)
+    assert module.HarvestConfig().shares == (0.6, 0.4)
     config = replace(TINY, kinds=("dense", "hash"), shares=(1.0, 3.0))
     drawn = [module._draw_field(np.random.default_rng([1, index]), config)[0] for index in range(400)]
     assert 0.68 < drawn.count("hash") / 400 < 0.82  # 3 of 4, give or take three standard deviations
@@ -176,7 +176,7 @@ def test_a_scene_that_fails_is_told_and_the_run_goes_on(tmp_path, monkeypatch):
 
     monkeypatch.setattr(training, "train_field", diverge)
     monkeypatch.setattr(torch, "set_num_threads", lambda count: None)  # this process keeps its own
-    index, problem = module._work(str(tmp_path), 3, 5, TINY, True)
+    index, problem = module._work(str(tmp_path), 3, 5, TINY, True, None)
     assert (index, problem) == (5, "train_field: the loss is not finite at step 3")
     assert not list(tmp_path.iterdir())
 
@@ -219,7 +219,7 @@ def test_bad_counts_are_refused_before_anything_is_written(tmp_path, arguments):
         ({"kinds": ("dense", "splat")}, r"kinds must be different ones of dense, hash, mlp, got .*splat"),
         ({"kinds": ("hash", "hash")}, "kinds must be different ones"),
         ({"kinds": (), "shares": ()}, "kinds must be different ones"),
-        ({"kinds": ("mlp",)}, r"shares must be one finite number > 0 for each of \('mlp',\), got \(0.5, 0.5\)"),
+        ({"kinds": ("mlp",)}, r"shares must be one finite number > 0 for each of \('mlp',\), got \(0.6, 0.4\)"),
         ({"shares": (1.0, 0.0)}, "shares must be one finite number > 0"),
         ({"cubes": 0}, "rays and cubes must be >= 1, got 1152 and 0"),
     ],

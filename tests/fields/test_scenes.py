@@ -2,16 +2,8 @@ import numpy as np
 import pytest
 
 from unghost.core.cameras import Cameras
-from unghost.fields.scenes import (
-    FURNITURE,
-    _random_shape,
-    _small_rotations,
-    look_at,
-    photograph,
-    random_scene,
-    random_texture,
-    sweep,
-)
+from unghost.fields.furniture import FURNITURE, random_shape, random_texture
+from unghost.fields.scenes import _small_rotations, look_at, photograph, random_scene, sweep
 from unghost.fields.solids import PATTERNS, Solid, SolidScene
 
 
@@ -148,7 +140,7 @@ def test_bounding_balls_of_single_shapes_hold_them():
     seen = set()
     points = np.random.default_rng(0).uniform(-3, 3, size=(20_000, 3))
     for seed in range(80):
-        solid = _random_shape(np.random.default_rng(seed), np.zeros(3), 1.0, np.eye(3))
+        solid = random_shape(np.random.default_rng(seed), np.zeros(3), 1.0, np.eye(3))
         inside = points[solid.distance(points) < 0]
         assert (np.linalg.norm(inside, axis=1) <= solid.bound + 1e-9).all()
         seen.add(solid.shape)

@@ -1,0 +1,73 @@
+"""A signed distance known at the nodes of a grid: a solid of any shape for a scene or a voxeliser. numpy only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class SampledDistance:
+    """Trilinear between nodes: its zero set *is* the solid, so that photos and labels agree on it exactly.
+
+    Beyond the grid the value is a lower bound of the distance: a ray may step that far.
+
+    Attributes:
+        values: ``(X, Y, Z)`` float32 signed distances at the nodes, > 0 on all six sides of the grid.
+        low: ``(3,)``, the first node.
+        pitch: between neighbouring nodes.
+    """
+
+    values: NDArray[np.float32]
+    low: Array
+    pitch: float
+
+    def __post_init__(self) -> None:
+        shape = self.values.shape
+        if len(shape) != 3 or min(shape) < 2:
+            raise ValueError(f"SampledDistance: values must have shape (X, Y, Z) with 2 nodes or more, got {shape}")
+        if not (np.isfinite(self.values).all() and 0 < self.pitch < np.inf):
+            raise ValueError(f"SampledDistance: values must be finite and pitch > 0, got pitch {self.pitch}")
+        sides = [self.values.take(end, axis=axis).min() for axis in range(3) for end in (0, -1)]
+        if min(sides) <= 0:
+            raise ValueError(f"SampledDistance: values must be > 0 on the sides of the grid, got {min(sides)}")
+
+    @property
+    def bound(self) -> float:
+        """Radius of a ball around the origin that holds the solid."""
+        solid = np.argwhere(self.values <= 0)
+        if not len(solid):
+            return 0.0
+        nodes = self.low + solid * self.pitch
+        return float(np.linalg.norm(nodes, axis=1).max() + np.sqrt(3.0) * self.pitch)
+
+    def scaled(self, factor: float) -> SampledDistance:
+        """The same solid ``factor`` times as large."""
+        if not 0 < factor < np.inf:
+            raise ValueError(f"scaled: factor must be finite and > 0, got {factor}")
+        return SampledDistance(self.values * np.float32(factor), self.low * factor, self.pitch * factor)
+
+    def __call__(self, positions: Array) -> Array:
+        """Signed distance ``(...)`` at ``positions (..., 3)``, in the grid's coordinates."""
+        shape = np.array(self.values.shape)
+        place = (np.asarray(positions, dtype=np.float64).reshape(-1, 3) - self.low) / self.pitch
+        within = np.clip(place, 0.0, shape - 1.0)
+        first = np.minimum(within.astype(np.int64), shape - 2)
+        share = within - first
+        flat, (_, rows, columns) = self.values.reshape(-1), self.values.shape
+        base = (first[:, 0] * rows + first[:, 1]) * columns + first[:, 2]
+        x, y, z = share.T
+        result = np.zeros(len(place))
+        for i, along_x in ((0, 1.0 - x), (1, x)):
+            for j, along_y in ((0, 1.0 - y), (1, y)):
+                row = base + (i * rows + j) * columns
+                result += along_x * along_y * ((1.0 - z) * flat[row] + z * flat[row + 1])
+        beyond = np.linalg.norm(place - within, axis=1) * self.pitch
+        out = beyond > 0
+        result[out] = np.maximum(result[out] - beyond[out], beyond[out])
+        return result.reshape(np.shape(positions)[:-1])
