@@ -32,7 +32,7 @@ from ..core.shards import (
 )
 from .harvest_config import HarvestConfig
 from .harvest_context import count_views, signed_opacity, surroundings
-from .harvest_labels import Truth, check_fit, severity_of
+from .harvest_labels import Labeller, Truth, check_fit, severity_of
 
 if TYPE_CHECKING:
     from ..core.sampled_distance import SampledDistance
@@ -70,7 +70,7 @@ def _propose(rng: np.random.Generator, field: TrainableField, count: int) -> NDA
 
 
 def harvest_cubes(
-    rng: np.random.Generator, field: TrainableField, truth: Truth, config: HarvestConfig
+    rng: np.random.Generator, field: TrainableField, truth: Labeller, config: HarvestConfig
 ) -> dict[str, NDArray[Any]]:
     """Cut ``config.cubes`` cubes out of a fitted field and label them: a shard's arrays, less ``group``."""
     count = config.cubes
@@ -95,7 +95,7 @@ def harvest_cubes(
             "labels": pack_labels(labels),
             "severity": severity_of(inputs, labels),
             "surroundings": quantize_signed(about),
-            "view_count": count_views(truth.photographed.cameras, *frames),
+            "view_count": count_views(truth.cameras, *frames),
         })  # fmt: skip
     arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     arrays["edge_fraction"] = (edges / scene_extent(field.aabb)).astype(np.float32)

@@ -54,6 +54,19 @@ class Photographed(Protocol):
         """``(N, H, W)`` depth along the optical axis, inf for sky."""
 
 
+class Labeller(Protocol):
+    """Who says what is true: :class:`Truth`, or whatever knows better than the field that cubes are cut from."""
+
+    @property
+    def cameras(self) -> Cameras:
+        """Those of the training photos, as the field was told."""
+
+    def labels(
+        self, positions: NDArray[np.float64], field_pitch: float, opaque: NDArray[np.bool_]
+    ) -> NDArray[np.uint8]:
+        """Three-valued labels ``(...)`` of world ``positions (..., 3)``, ``opaque (...)`` in the field or not."""
+
+
 class Truth:
     """The labels of a photographed scene; a coarse grid of exact distances settles most points.
 
@@ -65,6 +78,11 @@ class Truth:
         axes = [np.linspace(aabb[0, axis], aabb[1, axis], nodes) for axis in range(3)]
         self._coarse = photographed.scene.signed_distance(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1))
         self._cell = (aabb[1] - aabb[0]) / (nodes - 1)
+
+    @property
+    def cameras(self) -> Cameras:
+        """Those of the photos, as a field is told."""
+        return self.photographed.cameras
 
     def distances(self, points: NDArray[np.float64], margin: float | NDArray[np.float64]) -> NDArray[np.float64]:
         """Signed distance of ``points (N, 3)``: exact where it is at most ``margin``, else some value beyond it.

@@ -1,0 +1,218 @@
+"""Do training cubes look like those of a real capture's field? Statistics side by side, and one distance each.
+
+    python benchmarks/harvest_statistics.py CAPTURE --train trajectory_1 --better trajectory_3 \
+        --harvest out/harvest --unseen out/harvest-mlp
+
+Sets: ``capture`` (fields of the capture, one a seed), ``harvest`` and its kinds of field, ``harvest-unseen-field`` (the
+kind held out), the built-in recipes (``procedural`` as bits and as soft opacities, ``meshes`` if a folder is given),
+``rooms``, and every family of corruption alone, on procedural cubes. The distance is that of
+``unghost.data_recipes.statistics``: in [0, 1], over what a cube's *input* shows; agreement with the truth stands
+beside it. Writes ``statistics.json`` and ``statistics.png``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from capture_cubes import capture_shards
+from fit_cache import say
+
+from unghost.core.occupancy import signed_from_occupancy
+from unghost.core.results import build_results, write_results
+from unghost.core.shards import read_shard
+from unghost.data_recipes.augment import CORRUPTIONS
+from unghost.data_recipes.curate import curate
+from unghost.data_recipes.harvest import harvest
+from unghost.data_recipes.harvest_config import HarvestConfig
+from unghost.data_recipes.pairs import make_chunk
+from unghost.data_recipes.preview import find_shards
+from unghost.data_recipes.recipe import Recipe, load_recipe
+from unghost.data_recipes.statistics import (
+    FEATURES,
+    CubeStatistics,
+    cube_statistics,
+    feature_distances,
+    sampling_floor,
+    shard_statistics,
+)
+
+ROOT = Path(__file__).resolve().parents[1]
+SEED = 91
+ROOM_SCENES = 12
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to compare.
+
+    Attributes:
+        capture: folder of a real capture.
+        harvest: folder of harvested shards.
+        train: the sweep that the capture's fields see.
+        better: the sweeps that its labelling field sees besides.
+        unseen: folder of harvested shards of the kind of field that is held out.
+        meshes: folder of meshes with a manifest.csv.
+        cubes: measured of each set.
+        seeds: of the capture's fields.
+        out: where statistics.json and statistics.png go.
+        cache: where fitted fields and the capture's cubes are kept.
+    """
+
+    capture: tyro.conf.Positional[Path]
+    harvest: Path
+    train: str = "trajectory_1"
+    better: tuple[str, ...] = ("trajectory_3",)
+    unseen: Path | None = None
+    meshes: Path | None = None
+    cubes: int = 600
+    seeds: tuple[int, ...] = (0, 1, 2)
+    out: Path = ROOT / "docs" / "results"
+    cache: Path = ROOT / "out" / "capture"
+
+    def command(self) -> str:
+        """Without anybody's paths."""
+        parts = [f"python benchmarks/harvest_statistics.py {self.capture.resolve().name} --train {self.train}"]
+        parts += [f"--better {' '.join(self.better)} --harvest {self.harvest.name} --cubes {self.cubes}"]
+        parts += [f"--unseen {self.unseen.name}"] if self.unseen else []
+        parts += ["--meshes MESHES"] if self.meshes else []
+        return " ".join([*parts, "--seeds", *map(str, self.seeds)])
+
+
+def by_kind(folder: Path) -> dict[str, list[Path]]:
+    """The shards of a harvest, by the kind of their field."""
+    kinds: dict[str, list[Path]] = {}
+    for path in find_shards(folder):
+        kinds.setdefault(read_shard(path).provenance["field"], []).append(path)
+    return kinds
+
+
+def corrupted(family: str, count: int) -> CubeStatistics:
+    """Procedural cubes with one family of corruption at severities over (0, 1]."""
+    recipe = dataclasses.replace(load_recipe("procedural"), clean_share=1.0, soft_share=0.0, empty_share=0.0)
+    chunk = make_chunk(recipe, SEED, None, 0, count)
+    inputs = np.empty(chunk.arrays["inputs"].shape, dtype=np.uint8)
+    for row, stored in enumerate(chunk.arrays["inputs"]):
+        rng = np.random.default_rng([SEED, row])
+        damaged = CORRUPTIONS[family](rng, stored > 127, float(rng.uniform(0.02, 1.0)))
+        inputs[row] = np.where(signed_from_occupancy(damaged) > 0, 255, 0)
+    return cube_statistics(inputs)
+
+
+def synthetic_sets(options: Options, folder: Path) -> Iterator[tuple[str, CubeStatistics]]:
+    """Recipes and rooms, made here."""
+    base = load_recipe("procedural")
+    wanted: list[tuple[str, Recipe]] = [
+        ("procedural, bits", dataclasses.replace(base, soft_share=0.0)),
+        ("procedural, soft", dataclasses.replace(base, soft_share=1.0)),
+    ]
+    wanted += [("meshes", load_recipe("meshes"))] if options.meshes else []
+    for number, (name, recipe) in enumerate(wanted):
+        root = options.meshes if recipe.source == "meshes" else None
+        shards = curate(recipe, folder / str(number), count=options.cubes, seed=SEED, mesh_root=root)
+        yield name, shard_statistics(shards, most=None)
+    each = HarvestConfig(cubes=-(-options.cubes // ROOM_SCENES))
+    harvest(folder / "rooms", scenes=ROOM_SCENES, seed=SEED, fit=False, config=each, mesh_root=options.meshes)
+    yield "rooms", shard_statistics(find_shards(folder / "rooms"), most=options.cubes)
+    for family in CORRUPTIONS:
+        yield f"corruption {family}", corrupted(family, options.cubes)
+
+
+def all_sets(options: Options, folder: Path) -> Iterator[tuple[str, CubeStatistics]]:
+    """The capture's first."""
+    each = -(-options.cubes // len(options.seeds))
+    cut = options.cache / f"cubes-{options.train}-{'-'.join(options.better)}-{each}"
+    shards = capture_shards(
+        options.capture, cut, train=options.train, better=options.better, cubes=each, seeds=options.seeds,
+        cache=options.cache,
+    )  # fmt: skip
+    yield "capture", shard_statistics(shards, most=options.cubes)
+    kinds = by_kind(options.harvest)
+    yield "harvest", shard_statistics(list(itertools.chain(*kinds.values())), most=options.cubes)
+    for kind, paths in sorted(kinds.items()):
+        yield f"harvest, {kind} fields", shard_statistics(paths, most=options.cubes)
+    if options.unseen:
+        yield "harvest-unseen-field", shard_statistics(find_shards(options.unseen), most=options.cubes)
+    yield from synthetic_sets(options, folder)
+
+
+def rows_of(found: dict[str, CubeStatistics]) -> list[dict[str, Any]]:
+    """A row a set: its distance to the capture's cubes, feature by feature, and its summary."""
+    rows = []
+    for name, measured in found.items():
+        parts = feature_distances(measured, found["capture"])
+        row: dict[str, Any] = {"method": name, "distance": round(float(np.mean(list(parts.values()))), 4)}
+        row["distances"] = {feature: round(value, 4) for feature, value in parts.items()}
+        rows.append({**row, **measured.summary()})
+    return rows
+
+
+def draw(path: Path, found: dict[str, CubeStatistics], rows: list[dict[str, Any]], floor: float) -> None:
+    """Distances as bars, and the distributions of a few sets as steps."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(2, 4, figsize=(16, 7.5), constrained_layout=True)
+    ordered = sorted((row for row in rows if row["method"] != "capture"), key=lambda row: -row["distance"])
+    bars = axes[0, 0]
+    names = [row["method"].replace("corruption ", "") for row in ordered]
+    colors = ["#2a7f62" if "harvest" in name else "#b8b8b8" for name in names]
+    bars.barh(names, [row["distance"] for row in ordered], color=colors)
+    bars.axvline(floor, color="#b03a2e", linewidth=1, label="two halves of the capture's own cubes")
+    bars.set_title("distance to the capture's cubes")
+    bars.tick_params(axis="y", labelsize=7)
+    bars.legend(fontsize=7, loc="lower right")
+    shown = {"capture": "#b03a2e", "harvest": "#2a7f62", "harvest-unseen-field": "#1f5f99",
+             "procedural, soft": "#d08c1d", "procedural, bits": "#8a8a8a"}  # fmt: skip
+    for axis, feature in zip(axes.flat[1:], FEATURES):
+        for name, color in shown.items():
+            if name in found:
+                values = np.sort(FEATURES[feature](found[name].features[feature]))
+                axis.step(values, np.arange(1, len(values) + 1) / len(values), color=color, linewidth=1.5, label=name)
+        axis.set_title(f"{feature.replace('_', ' ')} (as the distance maps it)", fontsize=9)
+        axis.set_ylabel("share of cubes", fontsize=8)
+        axis.set_ylim(0, 1)
+    axis = axes.flat[7]
+    for name, color in shown.items():
+        if name in found:
+            shares = found[name].opacity_histogram(20)
+            axis.step(np.linspace(0.025, 0.975, 20), shares, where="mid", color=color, linewidth=1.5, label=name)
+    axis.set_yscale("log")
+    axis.set_title("opacity of all voxels", fontsize=9)
+    axes.flat[1].legend(fontsize=8)
+    figure.savefig(path, dpi=90)
+    plt.close(figure)
+
+
+def main() -> None:
+    options = tyro.cli(Options, description=__doc__)
+    found: dict[str, CubeStatistics] = {}
+    with tempfile.TemporaryDirectory() as temporary:
+        for name, measured in all_sets(options, Path(temporary)):
+            say(f"{name}: {len(measured)} cubes")
+            found[name] = measured
+    rows, floor = rows_of(found), sampling_floor(found["capture"])
+    results = build_results(
+        rows, command=options.command(), seeds=[SEED, *options.seeds], capture=options.capture.resolve().name,
+        sampling_floor=round(floor, 4), harvest_scenes=len(find_shards(options.harvest)),
+    )  # fmt: skip
+    options.out.mkdir(parents=True, exist_ok=True)
+    write_results(options.out / "statistics.json", results)
+    draw(options.out / "statistics.png", found, rows, floor)
+    for row in rows:
+        agreement = f"  IoU with the truth {row['iou']['mean']:.3f}" if "iou" in row else ""
+        say(f"{row['method']:34s} distance {row['distance']:.3f}{agreement}")
+    say(f"two halves of the capture's cubes  {floor:.3f}")
+
+
+if __name__ == "__main__":
+    main()
