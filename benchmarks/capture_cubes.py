@@ -1,77 +1,87 @@
 """Cubes of a real capture's field, labelled by a field that saw more: what a harvest cannot make, a prior must meet.
 
-There is no truth of a real room. What stands for it is the *pseudo ground truth* of the protocol, a field fitted to
-the training sweep and to another one: a voxel is true where that field is opaque, free where it is not, even one cell
-around, and a training photo looks there. Everything else does not count.
+There is no truth of a real room. What stands for it is the *pseudo ground truth* of the protocol: a field fitted to the
+training sweep and to others, seen from all of their photos. Its own fog must not count as truth, so labels are not its
+opacity but what its depth maps say by a vote of the photos, in the words of ``data_recipes.harvest_labels``:
+
+surface  two photos or more have their depth within three quarters of a cell there, and no more look through; and what
+         is opaque up to four cells behind such depths, if no photo looks through
+free     two photos or more look through, more than one and a half cells in front of their depth, and more than see a
+         surface there; and a training photo looks there
+ignore   the rest
 """
 
 from __future__ import annotations
 
-import itertools
-from dataclasses import dataclass, field
+import functools
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import torch
 from capture import Options as CaptureOptions
-from capture import Sweep, fit_field
-from fit_cache import FitCache, say
+from capture import Sweep, fit_field, render
+from fit_cache import FitCache, code_hash, say
 from numpy.typing import NDArray
 
+import unghost.fields
 from unghost.core.aabb import contains
 from unghost.core.cameras import Cameras
-from unghost.core.occupancy import (
-    DEFAULT_OPACITY_THRESHOLD,
-    FREE_LABEL,
-    IGNORE_LABEL,
-    SURFACE_LABEL,
-    opacity_from_density,
-)
+from unghost.core.occupancy import FREE_LABEL, IGNORE_LABEL, SURFACE_LABEL
 from unghost.core.shards import write_shard
 from unghost.data_recipes.harvest import harvest_cubes
 from unghost.data_recipes.harvest_config import HarvestConfig
+from unghost.data_recipes.harvest_labels import BEHIND_BAND, FREE_BAND, SURFACE_BAND
 from unghost.evaluation.captures import load_capture
-from unghost.fields.radiance import RadianceField
+from unghost.evaluation.protocol import optical_depth
 
-SURELY_EMPTY = 0.05  # opacity over one cell
 STEPS = 360  # of fitting a field, as in docs/results/capture.json
+VOTES = 2
+LOOSE = 0.004  # of the depth: what half a pixel is off on a slanted surface
 
 
 @dataclass(frozen=True)
 class PseudoTruth:
-    """Labels by a better field.
+    """Labels by the depth maps of a better field.
 
     Attributes:
-        better: fitted to more photos.
         cameras: of the training photos.
+        aabb: ``(2, 3)``, outside of which nothing counts.
+        all_cameras: ``n`` cameras of all photos that the better field saw.
+        depth: ``(n, H, W)`` its depth along the optical axis of each, inf for nothing.
     """
 
-    better: RadianceField
     cameras: Cameras
-    offsets: NDArray[np.float64] = field(
-        default_factory=lambda: np.array([o for o in itertools.product((-1, 0, 1), repeat=3) if np.abs(o).sum() == 1.0])
-    )
+    aabb: NDArray[np.float64]
+    all_cameras: Cameras
+    depth: NDArray[np.float64]
 
-    def _opacity(self, positions: NDArray[np.float64], pitch: float) -> NDArray[Any]:
-        with torch.no_grad():
-            density = self.better.density_fn(torch.from_numpy(positions.astype(np.float32)))[..., 0]
-        opacity: NDArray[Any] = opacity_from_density(density.numpy(), pitch)
-        return opacity
+    def votes(self, points: NDArray[np.float64], pitch: float) -> NDArray[np.int64]:
+        """How many photos say of ``points (N, 3)``: looked through, surface, just behind it: ``(3, N)``."""
+        votes = np.zeros((3, len(points)), dtype=np.int64)
+        for index in range(len(self.all_cameras)):
+            pixels, depth, visible = self.all_cameras.project(index, points)
+            rows = np.flatnonzero(visible)
+            column, line = np.floor(pixels[rows]).astype(np.int64).T
+            shape = self.depth.shape[1:]
+            there = self.depth[index][np.clip(line, 0, shape[0] - 1), np.clip(column, 0, shape[1] - 1)]
+            gap, loose = there - depth[rows], LOOSE * depth[rows]
+            votes[0, rows] += gap > FREE_BAND * pitch + loose
+            votes[1, rows] += np.abs(gap) <= SURFACE_BAND * pitch + loose
+            votes[2, rows] += (-gap > SURFACE_BAND * pitch + loose) & (-gap <= BEHIND_BAND * pitch)
+        return votes
 
     def labels(
         self, positions: NDArray[np.float64], field_pitch: float, opaque: NDArray[np.bool_]
     ) -> NDArray[np.uint8]:
         """As ``data_recipes.harvest_labels.Labeller`` has it."""
-        here = self._opacity(positions, field_pitch)
-        about = np.maximum.reduce(
-            [here, *(self._opacity(positions + field_pitch * o, field_pitch) for o in self.offsets)]
-        )
-        counts = contains(self.better.aabb, positions)
-        counts &= self.cameras.view_count(positions.reshape(-1, 3)).reshape(counts.shape) > 0
+        points = positions.reshape(-1, 3)
+        through, surface, behind = self.votes(points, field_pitch).reshape(3, *positions.shape[:-1])
+        seen = self.cameras.view_count(points).reshape(positions.shape[:-1]) > 0
+        counts = contains(self.aabb, positions)
         labels = np.full(counts.shape, IGNORE_LABEL, dtype=np.uint8)
-        labels[counts & (about < SURELY_EMPTY)] = FREE_LABEL
-        labels[counts & (here > DEFAULT_OPACITY_THRESHOLD)] = SURFACE_LABEL
+        labels[counts & seen & (through >= VOTES) & (through > surface)] = FREE_LABEL
+        labels[counts & opaque & (behind >= VOTES) & (through == 0)] = SURFACE_LABEL
+        labels[counts & (surface >= VOTES) & (surface >= through)] = SURFACE_LABEL
         return labels
 
 
@@ -97,7 +107,13 @@ def capture_shards(
         return Sweep(loaded.cameras.select(chosen), loaded.images(chosen))
 
     say(f"pseudo ground truth: {', '.join((train, *better))}")
-    truth = PseudoTruth(fit_field(options, fits, "pseudo", sweep(train, *better), 0)[0], sweep(train).cameras)
+    both = sweep(train, *better)
+    pseudo, record = fit_field(options, fits, "pseudo", both, 0)
+    key = {"field": record["sha256"], "code": code_hash(unghost.fields), "photos": both.digest()}
+    views = fits.views("pseudo-all", key, functools.partial(render, pseudo, both.cameras))
+    truth = PseudoTruth(
+        sweep(train).cameras, pseudo.aabb, both.cameras, optical_depth(np.asarray(views["depth"]), both.cameras)
+    )
     shards = []
     for seed in seeds:
         target = out / f"seed-{seed}"

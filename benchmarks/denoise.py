@@ -1,40 +1,40 @@
-"""How well, and how fast, one denoising step restores cubes that the prior has not seen.
+"""The reference measurement: how well, and how fast, one denoising step restores cubes that nobody trained on.
 
-    python benchmarks/denoise.py --meshes ../shared/data/meshes --harvest out/harvest-val
+    python benchmarks/denoise.py --meshes MESHES --harvest out/harvest-val --unseen out/harvest-mlp --capture CAPTURE
 
-Sets: ``synthetic`` (bits: cubes of meshes of the ``test`` split, corrupted), ``synthetic-soft`` (the same as soft
-opacities), ``clean`` (the same, untouched) and, if a folder is given, ``harvest`` (cubes of fields fitted to scenes
-that were not trained on). Methods: the input as it is, classical clean-up of the bits (small components removed,
-then a closing), and the prior. Cubes without any surface are left out: both would score 1 for nothing.
-Writes ``denoise.json``. IoU: opacity > 0.1 before, x0_pred > 0 after, ignored voxels left out.
+Sets (``denoise_sets.py``): ``clean`` and ``synthetic`` (bits: cubes of meshes of the ``test`` split, every family of
+corruption at five severities, and ``mixed`` as recipes have it), ``synthetic-soft``, ``harvest`` (fields fitted to
+scenes that were not trained on), ``harvest-unseen-field`` (of a kind not trained on) and ``capture`` (a real
+capture's field against its pseudo ground truth, ``capture_cubes.py``). Methods: the input as it is, classical filters
+(``classical.py``), every model named. Each model is scored at its default timestep; on ``mixed`` also at the best of
+a few. Scores: ``denoise_scores.py``. Writes ``denoise.json`` and ``denoise.png``; finished rows are kept at once.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import tyro
+from classical import Classical
+from denoise_figure import draw
+from denoise_scores import score
+from denoise_sets import MIXED, SEED, SEVERITIES, CubeSet, capture_set, harvest_set, mesh_sets
+from fit_cache import file_hash, say
 from numpy.typing import NDArray
-from scipy import ndimage
+from unghost.core.channels import channels_of_cubes
 
 from unghost import load_denoiser
 from unghost.bench import measure_speed
-from unghost.core.manifest import Manifest
-from unghost.core.occupancy import DEFAULT_OPACITY_THRESHOLD, opacity_from_signed, signed_from_occupancy
+from unghost.core.arrays import to_numpy
 from unghost.core.results import build_results, write_results
-from unghost.core.shards import read_shard, unpack_labels, write_shard
-from unghost.data_recipes.curate import curate
-from unghost.data_recipes.recipe import load_recipe
-from unghost.prior.evaluate import evaluate
 
 ROOT = Path(__file__).resolve().parents[1]
-BANDS = ((0.0, 0.25), (0.25, 0.5), (0.5, 0.75), (0.75, 1.0))
-SEED = 77
+TIMESTEPS = (100, 300, 500, 700, 999)
+BATCH, SPEED_SECONDS = 40, 8.0
 
 
 @dataclass(frozen=True)
@@ -44,115 +44,162 @@ class Options:
     Attributes:
         meshes: folder of meshes with a manifest.csv.
         harvest: folder of harvested shards of scenes that were not trained on.
-        cubes: per row.
-        threads: of onnxruntime, for the speed.
-        denoiser: a shipped name or a file.
-        out: where denoise.json goes.
+        unseen: the same of a kind of field that was not trained on.
+        capture: folder of a real capture.
+        models: of those to compare, NAME=FILE (.onnx or .safetensors); ``unghost`` is the shipped one.
+        cubes: of each set; a tenth as many of each single family of corruption and severity.
+        threads: of onnxruntime and torch, for the speed.
+        timesteps: also score all sets at these (a row each, named NAME@t): for diffusion models.
+        out: where denoise.json and denoise.png go.
+        cache: where the capture's fields and cubes are kept.
     """
 
     meshes: Path
     harvest: Path | None = None
+    unseen: Path | None = None
+    capture: Path | None = None
+    models: tuple[str, ...] = ("unghost=default",)
     cubes: int = 400
     threads: int = 2
-    denoiser: str = "default"
+    timesteps: tuple[int, ...] = ()
     out: Path = ROOT / "docs" / "results"
+    cache: Path = ROOT / "out" / "capture"
+
+    def command(self) -> str:
+        """Without anybody's paths."""
+        parts = [f"python benchmarks/denoise.py --meshes {self.meshes.name} --cubes {self.cubes}"]
+        for name in ("harvest", "unseen", "capture"):
+            folder = getattr(self, name)
+            parts += [f"--{name} {folder.resolve().name}"] if folder else []
+        named = [f"{name}={Path(file).name}" for name, file in self.named()]
+        parts += [f"--models {' '.join(named)}"] if self.models != ("unghost=default",) else []
+        parts += [f"--timesteps {' '.join(map(str, self.timesteps))}"] if self.timesteps else []
+        return " ".join(parts)
+
+    def named(self) -> list[tuple[str, str]]:
+        """Names and files of the models."""
+        pairs = [text.partition("=") for text in self.models]
+        if not all(sign for _, sign, _ in pairs):
+            raise ValueError(f"--models: each must be NAME=FILE, got {' '.join(self.models)}")
+        return [(name, file) for name, _, file in pairs]
 
 
-class Classical:
-    """Bits in, bits out; the same interface as a denoiser."""
-
-    kind = "numpy"
-
-    def __init__(self, name: str) -> None:
-        self.manifest = Manifest(name)
-
-    def __call__(self, channels: Any, timestep: Any, edge_fraction: Any) -> NDArray[np.float32]:
-        """See ``core.manifest.Denoiser``."""
-        occupied = opacity_from_signed(channels[:, 0]) > DEFAULT_OPACITY_THRESHOLD
-        if self.manifest.name != "input":
-            occupied = np.stack([components_and_closing(cube) for cube in occupied])
-        return signed_from_occupancy(occupied)[:, None]
-
-
-def components_and_closing(occupied: NDArray[np.bool_], *, smallest: int = 64) -> NDArray[np.bool_]:
-    labels, count = ndimage.label(occupied, structure=np.ones((3, 3, 3)))
-    large = np.bincount(labels.ravel(), minlength=count + 1) >= smallest
-    large[0] = False
-    kept = np.pad(large[labels], 2, mode="edge")
-    return ndimage.binary_closing(kept)[2:-2, 2:-2, 2:-2] | large[labels]
-
-
-def with_surface(folder: Path, target: Path, count: int) -> Path:
-    """A shard of the first ``count`` cubes of a shard whose labels hold any surface."""
-    shard = read_shard(folder)
-    chosen = [i for i in range(len(shard)) if (unpack_labels(shard.labels[i : i + 1]) == 1).any()][:count]
-    names = ("inputs", "labels", "severity", "edge_fraction", "group")
-    write_shard(target, {name: np.array(getattr(shard, name)[chosen]) for name in names}, shard.provenance)
-    return target
-
-
-def mesh_sets(options: Options, folder: Path) -> list[tuple[str, Path]]:
-    base = dataclasses.replace(
-        load_recipe("meshes"), split="test", licences=("CC0-1.0", "MIT-0", "CC-BY-3.0"), empty_share=0.0,
-        on_share=0.8, near_share=0.2, cubes_per_mesh=4,
+def predict(denoiser: Any, cubes: CubeSet, rows: NDArray[np.int64], timestep: int) -> NDArray[np.float32]:
+    """``x0_pred (n, 32, 32, 32)`` for some cubes of a set."""
+    channels = channels_of_cubes(
+        denoiser.manifest.channels, cubes.signed[rows],
+        surroundings=None if cubes.surroundings is None else cubes.surroundings[rows],
+        view_count=None if cubes.view_count is None else cubes.view_count[rows],
     )  # fmt: skip
-    wanted = [("clean", {"clean_share": 1.0})]
-    for kind, soft in (("synthetic", 0.0), ("synthetic-soft", 1.0)):
-        wanted += [(kind, {"clean_share": 0.0, "soft_share": soft, "severity": band}) for band in BANDS]
-    found = []
-    for number, (kind, changes) in enumerate(wanted):
-        raw = curate(
-            dataclasses.replace(base, **changes), folder / f"raw-{number}",
-            count=round(1.3 * options.cubes), seed=SEED, mesh_root=options.meshes,
-        )  # fmt: skip
-        band = changes.get("severity")
-        name = f"{kind} {band[0]:g}-{band[1]:g}" if band else kind
-        found.append((name, with_surface(raw[0], folder / f"set-{number}", options.cubes)))
-    return found
+    edge = cubes.edge_fraction[rows]
+    if denoiser.kind == "torch":
+        import torch
+
+        return to_numpy(denoiser(torch.from_numpy(channels), timestep, torch.from_numpy(edge)))[:, 0]
+    result: NDArray[np.float32] = to_numpy(denoiser(channels, timestep, edge))[:, 0]
+    return result
 
 
-def rows_of(denoiser: Any, name: str, sets: list[tuple[str, Path]], options: Options) -> list[dict[str, Any]]:
-    rows = []
-    for label, path in sets:
-        kind, _, band = label.partition(" ")
-        scores = evaluate(denoiser, read_shard(path))
-        keys = ("cubes", "timestep", "iou_before", "iou", "ghosts_removed_98", "ghosts_removed_98_opacity")
-        row: dict[str, Any] = {"method": name, "set": kind, **({"severity": band} if band else {})}
-        rows.append(row | {key: scores[key] for key in keys})
-    if options.harvest is not None:
-        rows.append(harvest_row(denoiser, name, options.harvest))
-    return rows
+def row_of(name: str, denoiser: Any, cubes: CubeSet, timestep: int) -> dict[str, Any]:
+    """Scores of one method on one set."""
+
+    def ask(rows: NDArray[np.int64]) -> NDArray[np.float32]:
+        return predict(denoiser, cubes, rows, timestep)
+
+    found = score(ask, cubes.signed, cubes.labels, cubes.group)
+    return {"method": name, "set": cubes.name, **cubes.about, "timestep": timestep, **found}
 
 
-def harvest_row(denoiser: Any, name: str, folder: Path) -> dict[str, Any]:
-    """Means over the shards (one a scene) of a harvest."""
-    scores = [evaluate(denoiser, read_shard(path)) for path in sorted(folder.glob("scene-*"))]
-    keys = ("iou_before", "iou", *(f"ghosts_removed_{k}{tail}" for k in (98, 95, 90) for tail in ("", "_opacity")))
-    means = {key: float(np.mean([s[key] for s in scores if s[key] is not None])) for key in keys}
-    return {"method": name, "set": "harvest", "scenes": len(scores), "cubes": sum(s["cubes"] for s in scores), **means}
+def with_best_timestep(row: dict[str, Any], name: str, denoiser: Any, cubes: CubeSet) -> dict[str, Any]:
+    """The row, and beside it the best of a few timesteps (chosen on this very set: a bound, not a score)."""
+    tried = {step: row_of(name, denoiser, cubes, step)["iou"] for step in TIMESTEPS} | {row["timestep"]: row["iou"]}
+    best = max(tried, key=lambda step: tried[step])
+    return row | {"timestep_best": best, "iou_at_best": tried[best]}
+
+
+def mean_over_severities(rows: list[dict[str, Any]], method: str) -> dict[str, Any]:
+    """One row for the mixed corruption: what the figure and the README show."""
+    chosen = [row for row in rows if row["method"] == method and row.get("family") == MIXED]
+    keys = ("iou_before", "iou", "iou_p5", "floater_recall", "surface_kept", "holes_filled", "ghosts_removed_98")
+    means = {key: float(np.mean([row[key] for row in chosen])) for key in keys}
+    return {"method": method, "set": "synthetic", "family": MIXED, "severity": "mean", **means}
+
+
+def all_sets(options: Options) -> list[CubeSet]:
+    """Every set that there is a folder for."""
+    sets = list(mesh_sets(options.meshes, options.cubes, max(1, options.cubes // 10)))
+    for name, folder in (("harvest", options.harvest), ("harvest-unseen-field", options.unseen)):
+        if folder is not None:
+            sets.append(harvest_set(name, folder, options.cubes))
+    if options.capture is not None:
+        sets.append(capture_set(options.capture, options.cache, options.cubes))
+    return sets
+
+
+def speed_row(name: str, file: str, denoiser: Any, threads: int) -> dict[str, Any]:
+    """Cubes a second, and how large the model is."""
+    manifest = denoiser.manifest
+    if denoiser.kind == "torch":
+        import torch
+
+        torch.set_num_threads(threads)
+    speed = measure_speed(denoiser, batch=BATCH, seconds=SPEED_SECONDS)
+    path = ROOT / "unghost" / "weights" / f"{file}.onnx" if "." not in file else Path(file)
+    size = {"megabytes": path.stat().st_size / 1e6} if path.is_file() else {}
+    return {
+        "method": name, "set": "speed", "runtime": "torch" if denoiser.kind == "torch" else "onnxruntime",
+        "threads": threads, "parameters": manifest.parameters, "gflop": manifest.training.get("gflop"),
+        "channels": list(manifest.channels), **size, **speed,
+    }  # fmt: skip
+
+
+def measure(options: Options) -> dict[str, Any]:
+    """Everything; the file grows with every method."""
+    methods = [(name, name, Classical(name)) for name in Classical.names()]
+    methods += [(name, file, load_denoiser(file, threads=options.threads)) for name, file in options.named()]
+    sets, rows = all_sets(options), list[dict[str, Any]]()
+    say(f"{sum(map(len, sets))} cubes in {len(sets)} sets, {len(methods)} methods")
+    results: dict[str, Any] = {}
+    for name, file, denoiser in methods:
+        learned = not isinstance(denoiser, Classical)
+        variants = [(name, denoiser.manifest.default_timestep)]
+        variants += [(f"{name}@{step}", step) for step in options.timesteps if learned]
+        for variant, timestep in variants:
+            for cubes in sets:
+                row = row_of(variant, denoiser, cubes, timestep)
+                if learned and cubes.about.get("family") == MIXED:
+                    row = with_best_timestep(row, variant, denoiser, cubes)
+                rows.append(row)
+            rows.append(mean_over_severities(rows, variant))
+            say(_headline(rows, variant))
+        if learned:
+            rows.append(speed_row(name, file, denoiser, options.threads))
+        priors = {name: file_hash(file) if "." in file else load_denoiser(file).manifest.body_sha256
+                  for name, file in options.named()}  # fmt: skip
+        results = build_results(
+            rows, command=options.command(), seeds=[SEED], priors=priors, severities=list(SEVERITIES)
+        )
+        write_results(options.out / "denoise.json", results)
+    return results
+
+
+def _headline(rows: list[dict[str, Any]], method: str) -> str:
+    mine = [row for row in rows if row["method"] == method]
+    mean = next(row for row in mine if row.get("severity") == "mean")
+    text = f"{method:22s} mixed {mean['iou_before']:.3f} -> {mean['iou']:.3f}"
+    for row in mine:
+        if row["set"] in ("harvest", "harvest-unseen-field", "capture"):
+            text += f"  {row['set']} {row['ghosts_removed_98']:.3f}"
+        if row["set"] == "clean":
+            text += f"  clean {row['iou']:.3f}"
+    return text
 
 
 def main() -> None:
     options = tyro.cli(Options, description=__doc__)
-    prior = load_denoiser(options.denoiser, threads=options.threads)
-    rows: list[dict[str, Any]] = []
-    with tempfile.TemporaryDirectory() as temporary:
-        sets = mesh_sets(options, Path(temporary))
-        for name, denoiser in (("input", Classical("input")), ("components+closing", Classical("components+closing"))):
-            rows += rows_of(denoiser, name, sets, options)
-        rows += rows_of(prior, "unghost", sets, options)
-    speed = measure_speed(prior, batch=40, seconds=8.0)
-    rows.append({"method": "unghost", "set": "speed", "threads": options.threads, **speed})
-    command = f"python benchmarks/denoise.py --meshes {options.meshes.name} --cubes {options.cubes}" + (
-        f" --harvest {options.harvest.name}" if options.harvest else ""
-    )
-    write_results(
-        options.out / "denoise.json",
-        build_results(rows, command=command, seeds=[SEED], prior=prior.manifest.body_sha256),
-    )
-    for row in rows:
-        text = " ".join(f"{k}={v:.3f}" if isinstance(v, float) else f"{k}={v}" for k, v in row.items())
-        print(text)
+    results = measure(dataclasses.replace(options, meshes=options.meshes.resolve()))
+    draw(options.out / "denoise.png", results["rows"])
+    say(f"{options.out / 'denoise.json'} and denoise.png")
 
 
 if __name__ == "__main__":

@@ -128,7 +128,7 @@ def synthetic_sets(options: Options, folder: Path) -> Iterator[tuple[str, CubeSt
 def all_sets(options: Options, folder: Path) -> Iterator[tuple[str, CubeStatistics]]:
     """The capture's first."""
     each = -(-options.cubes // len(options.seeds))
-    cut = options.cache / f"cubes-{options.train}-{'-'.join(options.better)}-{each}"
+    cut = options.cache / f"cubes-{each}"
     shards = capture_shards(
         options.capture, cut, train=options.train, better=options.better, cubes=each, seeds=options.seeds,
         cache=options.cache,

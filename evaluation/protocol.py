@@ -71,7 +71,7 @@ def visibility_masks(
         raise ValueError(f"visibility_masks: minimum_views must be >= 1, got {minimum_views}")
     optical = None
     if train_depth is not None:
-        optical = _optical_depth(_depths("visibility_masks", train_depth, train_cameras, "train_depth"), train_cameras)
+        optical = optical_depth(_depths("visibility_masks", train_depth, train_cameras, "train_depth"), train_cameras)
     far = FAR * depth_limit(train_cameras, eval_cameras)
     masks = np.zeros(depth.shape, dtype=bool)
     for index in range(len(eval_cameras)):
@@ -212,7 +212,7 @@ def _depths(caller: str, depth: NDArray[Any], cameras: Cameras, name: str) -> ND
     return array
 
 
-def _optical_depth(depth: NDArray[Any], cameras: Cameras) -> NDArray[np.float64]:
+def optical_depth(depth: NDArray[Any], cameras: Cameras) -> NDArray[np.float64]:
     """Distance along unit rays to depth along the optical axis: times the cosine."""
     result = np.empty(depth.shape)
     for index in range(len(cameras)):

@@ -1,0 +1,64 @@
+"""The speed-error figure of the reference measurement, its Pareto front marked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+PANELS = (
+    ("synthetic", "iou", "mean IoU, mixed corruption of unseen meshes"),
+    ("harvest", "ghosts_removed_98", "ghosts removed at .98 kept, unseen scenes"),
+    ("capture", "ghosts_removed_98", "ghosts removed at .98 kept, real capture"),
+)
+
+
+def pareto(points: Sequence[tuple[float, float]]) -> list[int]:
+    """Which of ``(speed, score)`` no other one beats in both, slowest first."""
+    front: list[int] = []
+    for index in sorted(range(len(points)), key=lambda i: (-points[i][0], -points[i][1])):
+        if not front or points[index][1] > points[front[-1]][1]:
+            front.append(index)
+    return front[::-1]
+
+
+def _value(rows: Sequence[dict[str, Any]], method: str, name: str, key: str) -> float | None:
+    for row in rows:
+        mean = row.get("severity") == "mean" if name == "synthetic" else True
+        if row["method"] == method and row["set"] == name and mean:
+            value = row.get(key)
+            return None if value is None else float(value)
+    return None
+
+
+def draw(path: Path, rows: Sequence[dict[str, Any]]) -> None:
+    """A panel a set: models against their speed, filters (untimed) as lines."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    speeds = {row["method"]: row["cubes_per_second"] for row in rows if row["set"] == "speed"}
+    names = list(dict.fromkeys(row["method"] for row in rows))
+    figure, axes = plt.subplots(1, len(PANELS), figsize=(17, 5.2), constrained_layout=True)
+    for axis, (name, key, heading) in zip(axes, PANELS):
+        found = {method: _value(rows, method, name, key) for method in names}
+        timed = [(method, speeds[method.partition("@")[0]], value) for method, value in found.items()
+                 if value is not None and method.partition("@")[0] in speeds]  # fmt: skip
+        for method, speed, value in timed:
+            axis.plot(speed, value, "o", color="#2a7f62")
+            axis.annotate(method, (speed, value), xytext=(5, 4), textcoords="offset points", fontsize=8)
+        front = [timed[index] for index in pareto([(speed, value) for _, speed, value in timed])]
+        axis.plot([speed for _, speed, _ in front], [value for _, _, value in front], color="#2a7f62", linewidth=1)
+        filters = {m: v for m, v in found.items() if v is not None and m.partition("@")[0] not in speeds}
+        for method in [*sorted(filters, key=lambda m: -(filters[m] or 0.0))[:2], "input"]:
+            if method in filters:
+                axis.axhline(filters[method], color="#999999", linewidth=0.8, linestyle="--")
+                axis.annotate(f"{method} (no training)", (0.01, filters[method]), fontsize=7, color="#666666",
+                              xycoords=("axes fraction", "data"), va="bottom")  # fmt: skip
+        axis.set_title(heading, fontsize=10)
+        axis.set_xlabel("cubes a second, two threads")
+        if timed:
+            axis.set_xscale("log")
+    figure.savefig(path, dpi=90)
+    plt.close(figure)

@@ -1,0 +1,143 @@
+"""The cubes of the reference measurement: nothing in them was trained on."""
+
+from __future__ import annotations
+
+import dataclasses
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from capture_cubes import capture_shards
+from numpy.typing import NDArray
+
+from unghost.core.occupancy import FREE_LABEL, SURFACE_LABEL, signed_from_occupancy
+from unghost.core.shards import Shard, dequantize_signed, read_shard, unpack_labels
+from unghost.data_recipes.augment import CORRUPTIONS, corrupt
+from unghost.data_recipes.curate import curate
+from unghost.data_recipes.preview import find_shards
+from unghost.data_recipes.recipe import load_recipe
+
+SEED = 77
+SEVERITIES = (0.1, 0.3, 0.5, 0.8, 1.0)
+MIXED = "mixed"
+CAPTURE_CUBES = 160  # of each of three fields
+
+
+@dataclass(frozen=True)
+class CubeSet:
+    """Labelled cubes.
+
+    Attributes:
+        name: ``clean``, ``synthetic``, ``synthetic-soft``, ``harvest``, ``harvest-unseen-field`` or ``capture``.
+        about: what tells rows of one set apart: ``family`` and ``severity`` of the corruption.
+        signed: ``(N, 32, 32, 32)`` float32 signed opacity.
+        labels: ``(N, 32, 32, 32)`` uint8.
+        edge_fraction: ``(N,)`` float32.
+        group: ``(N,)`` int32, mesh or scene.
+        surroundings: ``(N, 16, 16, 16)`` uint8, or None.
+        view_count: ``(N, 32, 32, 32)`` uint8, or None.
+    """
+
+    name: str
+    about: dict[str, Any]
+    signed: NDArray[np.float32]
+    labels: NDArray[np.uint8]
+    edge_fraction: NDArray[np.float32]
+    group: NDArray[np.int32]
+    surroundings: NDArray[np.uint8] | None = None
+    view_count: NDArray[np.uint8] | None = None
+
+    def __len__(self) -> int:
+        return len(self.signed)
+
+    def first(self, count: int) -> CubeSet:
+        """The first ``count`` cubes of it."""
+        arrays = {
+            item.name: value[:count]
+            for item in dataclasses.fields(self)
+            if isinstance(value := getattr(self, item.name), np.ndarray)
+        }
+        return dataclasses.replace(self, **arrays)
+
+
+def from_shards(name: str, shards: list[Shard], count: int, **about: Any) -> CubeSet:
+    """Some ``count`` cubes with any surface, as many from each shard."""
+    parts = []
+    for number, shard in enumerate(shards):
+        wanted = count * (number + 1) // len(shards) - count * number // len(shards)
+        labels = unpack_labels(np.array(shard.labels))
+        rows = np.flatnonzero((labels == SURFACE_LABEL).any(axis=(1, 2, 3)))
+        rows = rows[np.linspace(0, len(rows) - 1, min(wanted, len(rows))).round().astype(int)] if len(rows) else rows
+        parts.append((shard, labels[rows], rows))
+    arrays: dict[str, Any] = {
+        "signed": np.concatenate([dequantize_signed(shard.inputs[rows]) for shard, _, rows in parts]),
+        "labels": np.concatenate([labels for _, labels, _ in parts]),
+    }
+    for key in ("edge_fraction", "group"):
+        arrays[key] = np.concatenate([getattr(shard, key)[rows] for shard, _, rows in parts])
+    for key in ("surroundings", "view_count"):
+        if all(getattr(shard, key) is not None for shard in shards):
+            arrays[key] = np.concatenate([getattr(shard, key)[rows] for shard, _, rows in parts])
+    return CubeSet(name, about, **arrays)
+
+
+def damaged(clean: CubeSet, family: str, severity: float) -> CubeSet:
+    """``clean`` cubes with one family of corruption, or ``mixed`` as recipes have it."""
+    function = corrupt if family == MIXED else CORRUPTIONS[family]
+    surface = clean.labels == SURFACE_LABEL
+    place = 1000 * SEVERITIES.index(severity) + [MIXED, *CORRUPTIONS].index(family)
+    signed = np.stack([
+        signed_from_occupancy(function(np.random.default_rng([SEED, place, row]), cube, severity))
+        for row, cube in enumerate(surface)
+    ])  # fmt: skip
+    about = {"family": family, "severity": severity}
+    return dataclasses.replace(clean, name="synthetic", about=about, signed=signed.astype(np.float32))
+
+
+def mesh_sets(meshes: Path, count: int, few: int) -> Iterator[CubeSet]:
+    """Cubes of meshes of the ``test`` split: untouched, corrupted as bits, and as soft opacities.
+
+    Args:
+        meshes: folder with a manifest.csv.
+        count: cubes of the mixed corruption and of the untouched.
+        few: cubes of each single family.
+    """
+    base = dataclasses.replace(
+        load_recipe("meshes"), split="test", licences=("CC0-1.0", "MIT-0", "CC-BY-3.0"), empty_share=0.0,
+        on_share=0.8, near_share=0.2, cubes_per_mesh=4,
+    )  # fmt: skip
+    with tempfile.TemporaryDirectory() as folder:
+
+        def cut(name: str, **changes: Any) -> CubeSet:
+            recipe, out = dataclasses.replace(base, **changes), Path(folder) / f"{name}-{len(changes)}"
+            shards = curate(recipe, out, count=round(1.3 * count), seed=SEED, mesh_root=meshes)
+            return from_shards(name, [read_shard(path) for path in shards], count)
+
+        clean = cut("clean", clean_share=1.0, soft_share=0.0)
+        soft = cut("synthetic-soft", clean_share=0.0, soft_share=1.0)
+    # the truth of an untouched cube is the cube: none of its voxels is left out
+    known = dataclasses.replace(clean, labels=np.where(clean.signed > 0, SURFACE_LABEL, FREE_LABEL).astype(np.uint8))
+    yield known
+    for severity in SEVERITIES:
+        yield damaged(known, MIXED, severity)
+    for family in CORRUPTIONS:
+        for severity in SEVERITIES:
+            yield damaged(known.first(few), family, severity)
+    yield soft
+
+
+def harvest_set(name: str, folder: Path, count: int) -> CubeSet:
+    """Cubes of harvested shards, as many from each scene."""
+    return from_shards(name, [read_shard(path) for path in find_shards(folder)], count)
+
+
+def capture_set(capture: Path, cache: Path, count: int) -> CubeSet:
+    """Cubes of fields of a real capture (its first sweep), three seeds, labelled by a field that saw the third too."""
+    shards = capture_shards(
+        capture, cache / f"cubes-{CAPTURE_CUBES}", train="trajectory_1", better=("trajectory_3",), cubes=CAPTURE_CUBES,
+        seeds=(0, 1, 2), cache=cache,
+    )  # fmt: skip
+    return from_shards("capture", [read_shard(path) for path in shards], count)
