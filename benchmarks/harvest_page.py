@@ -1,0 +1,206 @@
+"""Show what a harvest is: a page with pictures, the statistics beside a real capture's, and a small sample.
+
+    python benchmarks/harvest_page.py out/harvest [--hours H]
+
+Writes docs/harvest.md and docs/harvest/pairs.png, and docs/harvest/sample: a shard of some fifty cubes of scenes
+without meshes (so that all of it is generated), for a look and for tests. Run benchmarks/harvest_statistics.py first.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from numpy.typing import NDArray
+
+from unghost.core.occupancy import FREE_LABEL, SURFACE_LABEL, opacity_from_signed
+from unghost.core.shards import Shard, dequantize_signed, read_shard, unpack_labels, write_shard
+from unghost.data_recipes.harvest_config import HarvestConfig
+from unghost.data_recipes.preview import draw_pair, find_shards
+from unghost.data_recipes.render import GHOST, SURFACE, UNJUDGED
+
+ROOT = Path(__file__).resolve().parents[1]
+SAMPLE_CUBES = 60  # 77 kB each
+SHOWN, WIDTH, GAP = 6, 192, 8
+HEADINGS = ("what the field shows", "the truth", "a slice: opacity", "labels", "surroundings", "views (white: 24+)")
+MOST_VIEWS = 24
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to show.
+
+    Attributes:
+        harvest: folder of harvested shards.
+        seconds: that the harvest took on two cores with nothing beside it; told in the page.
+        scenes: that were asked for.
+        docs: the folder that is written to.
+    """
+
+    harvest: tyro.conf.Positional[Path]
+    seconds: float | None = None
+    scenes: int = 0
+    docs: Path = ROOT / "docs"
+
+
+def facts(shards: list[Shard]) -> dict[str, Any]:
+    """What is in a harvest."""
+    told = [shard.provenance for shard in shards]
+    return {
+        "scenes": len(shards),
+        "pairs": sum(map(len, shards)),
+        "kinds": dict(sorted(Counter((p["field"], p["resolution"]) for p in told).items())),
+        "with_meshes": sum(bool(p["meshes"]) for p in told),
+        "meshes": len({mesh["sha256"] for p in told for mesh in p["meshes"]}),
+        "licences": dict(Counter(p["licence"] for p in told)),
+        "psnr": [float(q) for q in np.quantile([p["psnr"] for p in told], [0.1, 0.5, 0.9])],
+    }
+
+
+def generated(shards: list[Shard]) -> list[Shard]:
+    """Those of scenes without meshes."""
+    return [shard for shard in shards if shard.provenance["licence"] == "generated"]
+
+
+def interesting(shard: Shard) -> NDArray[np.int64]:
+    """Rows from the one with the best mixture of surface and ghosts to the one with the worst."""
+    opaque = opacity_from_signed(dequantize_signed(np.array(shard.inputs))) > 0.1
+    labels = unpack_labels(np.array(shard.labels))
+    counts = [(opaque & (labels == label)).sum(axis=(1, 2, 3)) for label in (SURFACE_LABEL, FREE_LABEL)]
+    return np.argsort(-np.minimum(*counts), kind="stable")
+
+
+def write_sample(shards: list[Shard], target: Path) -> int:
+    """Cubes evenly from some scenes; returns how many bytes they take."""
+    chosen = [shards[i] for i in np.unique(np.linspace(0, len(shards) - 1, 12).round().astype(int))]
+    each = SAMPLE_CUBES // len(chosen)
+    rows = [np.linspace(0, len(shard) - 1, each).round().astype(int) for shard in chosen]
+    names = ("inputs", "labels", "severity", "edge_fraction", "group", "surroundings", "view_count", "frames")
+    arrays = {name: np.concatenate([getattr(s, name)[r] for s, r in zip(chosen, rows)]) for name in names}
+    if target.exists():
+        shutil.rmtree(target)
+    provenance = {
+        "recipe": "harvest", "licence": "generated", "sample_of": f"{len(shards)} scenes",
+        "scenes": [{k: s.provenance[k] for k in ("seed", "scene", "field", "resolution", "steps")} for s in chosen],
+    }  # fmt: skip
+    write_shard(target, arrays, provenance)
+    return sum(path.stat().st_size for path in target.iterdir())
+
+
+def _grown(slab: NDArray[Any]) -> NDArray[np.uint8]:
+    """A slice ``(n, n)`` or ``(n, n, 3)`` in [0, 1] as a square picture, its second axis upwards."""
+    factor = WIDTH // len(slab)
+    picture = np.repeat(np.repeat(np.swapaxes(slab, 0, 1)[::-1], factor, axis=0), factor, axis=1)
+    picture = np.repeat(picture[..., None], 3, axis=2) if picture.ndim == 2 else picture
+    return (255 * np.clip(picture, 0, 1)).round().astype(np.uint8)
+
+
+def draw_row(shard: Shard, row: int) -> list[NDArray[np.uint8]]:
+    """Six pictures of one pair."""
+    assert shard.surroundings is not None
+    assert shard.view_count is not None
+    signed, labels = dequantize_signed(shard.inputs[row]), unpack_labels(shard.labels[row : row + 1])[0]
+    middle, colors = signed.shape[2] // 2, np.array([GHOST, SURFACE, UNJUDGED])
+    opaque = opacity_from_signed(signed)[:, :, middle]
+    about = opacity_from_signed(dequantize_signed(shard.surroundings[row]))
+    return [
+        *draw_pair(signed, labels, width=WIDTH),
+        _grown(np.sqrt(opaque)),
+        _grown(colors[labels[:, :, middle]]),
+        _grown(np.sqrt(about[:, :, about.shape[2] // 2])),
+        _grown(np.asarray(shard.view_count[row][:, :, middle], dtype=np.float64) / MOST_VIEWS),
+    ]
+
+
+def draw(shards: list[Shard], path: Path) -> None:
+    """Some pairs, one a row."""
+    from PIL import Image, ImageDraw
+
+    chosen = [shards[i] for i in np.linspace(0, len(shards) - 1, SHOWN).round().astype(int)]
+    rows = [draw_row(shard, int(interesting(shard)[2])) for shard in chosen]
+    across, top = len(HEADINGS) * (WIDTH + GAP) + GAP, 26
+    sheet = Image.new("RGB", (across, top + SHOWN * (WIDTH + GAP)), "white")
+    pen = ImageDraw.Draw(sheet)
+    for column, heading in enumerate(HEADINGS):
+        left = GAP + column * (WIDTH + GAP)
+        pen.text((left, 8), heading, fill=(60, 60, 60))
+        for line, pictures in enumerate(rows):
+            sheet.paste(Image.fromarray(pictures[column]), (left, top + line * (WIDTH + GAP)))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    sheet.quantize(200).save(path, optimize=True)
+
+
+def statistics_table(docs: Path) -> list[str]:
+    """The sets of docs/results/statistics.json, nearest first."""
+    results = json.loads((docs / "results" / "statistics.json").read_text(encoding="utf-8"))
+    keys = ("occupied_share", "thickness", "components", "contrast", "iou", "ghost_share")
+    lines = [
+        "| cubes | distance | occupied | thickness | components | contrast | IoU with the truth | opaque, a ghost |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for row in sorted(results["rows"], key=lambda row: row["distance"]):
+        cells = [f"{row[key]['mean']:.2f}" if key in row else "–" for key in keys]
+        lines.append(f"| {row['method']} | {row['distance']:.3f} | {' | '.join(cells)} |")
+    return [
+        *lines, "",
+        f"Two random halves of the capture's cubes are at {results['sampling_floor']:.3f} from each other. "
+        f"`{results['command']}`",
+    ]  # fmt: skip
+
+
+def page(options: Options, found: dict[str, Any], sample_bytes: int) -> str:
+    """The text of docs/harvest.md."""
+    config = HarvestConfig()
+    kinds = ", ".join(f"{count} {kind} at {resolution}" for (kind, resolution), count in found["kinds"].items())
+    low, middle, high = found["psnr"]
+    time = f", in {options.seconds / 3600:.1f} hours on two cores" if options.seconds else ""
+    asked = f" of {options.scenes} (in the others a fit failed or no free path was found)" if options.scenes else ""
+    return "\n".join([
+        "# The harvest", "",
+        "What a badly constrained field gets wrong is thick smooth fog, not blobs, and no synthetic corruption looks "
+        "like it. So the larger part of the training pairs is *harvested*: a synthetic room of known geometry is "
+        f"photographed along a casual sweep ({config.photos[0]}–{config.photos[1]} small photos with wrong exposures, "
+        "noise and poses that are slightly off), a radiance field is fitted to the photos, and not for long, and cubes "
+        "of its opacity become inputs. The signed distance of the room gives the labels. This page is written by "
+        "`python benchmarks/harvest_page.py`.", "",
+        f"**This one**: {found['pairs']:,} pairs of {found['scenes']} scenes{asked}{time}. "
+        f"Fields (kind, cells along an axis): {kinds}. PSNR on their own photos: {middle:.1f} dB (one in ten below "
+        f"{low:.1f}, one above {high:.1f}). {found['with_meshes']} scenes hold some of {found['meshes']} different "
+        "meshes beside procedural furniture.", "",
+        "    unghost harvest --out out/harvest --scenes 210 --seed 0 --workers 2 --mesh-root MESHES", "",
+        "It can be killed and started again; scene i depends on (seed, i) alone. A frequency-encoded MLP is never "
+        "harvested for training (`--kinds mlp --seed 1` makes the set that is held out).", "",
+        "![six pairs, one a row](harvest/pairs.png)", "",
+        "Grey is true surface, **orange** a ghost, **blue** surface that the field lacks, violet what nobody judges: "
+        "inside solids and walls, the band about a surface, what no photo saw. A slice is the middle one along z; "
+        "opacities are drawn as their square roots, so that thin fog shows. `surroundings` is the same centre at "
+        "three times the edge; `views` counts the photos that have a voxel in their frustum, hidden or not.", "",
+        f"[A sample](harvest/sample) of {SAMPLE_CUBES} pairs ({sample_bytes / 1e6:.1f} MB, scenes without meshes) is "
+        "in the repository: `unghost preview docs/harvest/sample`.", "",
+        "## Does it look like a real capture's field?", "",
+        "Cubes of fields fitted to the first sweep of a real capture, cut as the harvest's are, against those of the "
+        "harvest and of the synthetic recipes. The distance (`unghost.data_recipes.statistics`) compares seven "
+        "features of the *input* alone: 0 for the same distributions, 1 at most.", "",
+        *statistics_table(options.docs), "",
+        "![distances, and distributions of the features](results/statistics.png)", "",
+    ])  # fmt: skip
+
+
+def main() -> None:
+    options = tyro.cli(Options, description=__doc__)
+    shards = [read_shard(path) for path in find_shards(options.harvest)]
+    found = facts(shards)
+    draw(shards, options.docs / "harvest" / "pairs.png")
+    size = write_sample(generated(shards), options.docs / "harvest" / "sample")
+    (options.docs / "harvest.md").write_text(page(options, found, size), encoding="utf-8")
+    print(f"{found['pairs']} pairs of {found['scenes']} scenes; look at {options.docs / 'harvest.md'}")
+
+
+if __name__ == "__main__":
+    main()
