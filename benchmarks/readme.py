@@ -39,35 +39,61 @@ def demo(results: dict[str, Any]) -> list[str]:
     return ["**The demo's room** (`make demo`; every ghost labelled):", "", *table(head, rows), "", said]
 
 
+FOG = {
+    "harvest": "fields of scenes not trained on",
+    "harvest-unseen-field": "a kind of field not trained on",
+    "capture": "a real capture's field",
+}
+
+
 def denoise(results: dict[str, Any]) -> list[str]:
     rows = results["rows"]
-    found = {(row["method"], row["set"], row.get("severity")): row for row in rows}
-    ours = [row for row in rows if row["method"] == "unghost" and row["set"] in ("clean", "synthetic")]
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    found = {(row["method"], row["set"], row.get("family"), row.get("severity")): row for row in rows}
+    severities = results["severities"]
+    wanted = [("clean", None, None), *(("synthetic", "mixed", severity) for severity in severities)]
+    head = ["method", "untouched", *(f"severity {severity:g}" for severity in severities), "cubes/s"]
+    speeds = {row["method"]: row for row in rows if row["set"] == "speed"}
     lines = []
-    for row in ours:
-        rival = found["components+closing", row["set"], row.get("severity")]
-        label = f"corrupted, severity {row['severity']}" if "severity" in row else "untouched"
-        lines.append([label, *(number(value) for value in (row["iou_before"], rival["iou"], row["iou"]))])
+    for method in methods:
+        ious = [number(found[(method, *key)]["iou"]) for key in wanted]
+        lines.append([method, *ious, f"{speeds[method]['cubes_per_second']:.0f}" if method in speeds else "–"])
     text = [
-        "**Cubes of meshes that were never trained on**, one step at the default timestep (mean IoU with the truth):"
-    ]
-    text += ["", *table(("cubes", "as they come", "components + closing", "unghost"), lines), ""]
-    harvest = found.get(("unghost", "harvest", None))
-    if harvest:
+        "**Cubes of meshes that were never trained on**, one step at the default timestep (mean IoU with the truth, "
+        f"{found['input', 'clean', None, None]['cubes']} cubes each):", "",
+        *table(head, lines), "",
+    ]  # fmt: skip
+    foggy = [name for name in FOG if ("input", name, None, None) in found]
+    if foggy:
+        lines = [[method, *(_removed(found[method, name, None, None]) for name in foggy)] for method in methods]
         text += [
-            f"**Cubes of badly constrained fields** of {harvest['scenes']} held-out scenes: ghost voxels removed while "
-            ".98 / .95 / .90 of the true ones stay, the threshold set for each scene by itself, mean over scenes: "
-            + " / ".join(number(harvest[f"ghosts_removed_{k}"], 2) for k in (98, 95, 90))
-            + " (thresholding the opacity: "
-            + " / ".join(number(harvest[f"ghosts_removed_{k}_opacity"], 2) for k in (98, 95, 90))
-            + "). With one threshold for all scenes far fewer go: the model card.", "",
+            "**Cubes of badly constrained fields**: ghost voxels removed while .98 / .90 of the true ones stay, one "
+            "threshold for all cubes of a set:", "",
+            *table(["method", *(FOG[name] for name in foggy)], lines), "",
         ]  # fmt: skip
-    speed = found["unghost", "speed", None]
-    text += [
-        f"**Speed**: {speed['cubes_per_second']:.0f} cubes/s through onnxruntime (fp32, batch {speed['batch']}, "
-        f"{speed['threads']} threads)."
+    speed = next(row for row in speeds.values() if row["runtime"] == "onnxruntime")
+    return [
+        *text,
+        f"Speed through onnxruntime (batch {speed['batch']}, {speed['threads']} threads).", "",
+        "![speed against error](docs/results/denoise.png)",
+    ]  # fmt: skip
+
+
+def _removed(row: Row) -> str:
+    return " / ".join(number(row[f"ghosts_removed_{kept}"], 2) for kept in (98, 90))
+
+
+def statistics(results: dict[str, Any]) -> list[str]:
+    distances = {row["method"]: row["distance"] for row in results["rows"]}
+    shown = ("harvest, dense fields", "harvest", "harvest-unseen-field", "rooms", "meshes", "procedural, soft",
+             "procedural, bits")  # fmt: skip
+    lines = [[name, number(distances[name])] for name in shown if name in distances]
+    return [
+        "**Do training cubes look like a real capture's field?** Distance of what the cubes show, in [0, 1]; two "
+        f"halves of the capture's own cubes are at {results['sampling_floor']:.3f} ([the harvest](docs/harvest.md)):",
+        "",
+        *table(("cubes", "distance"), lines),
     ]
-    return text
 
 
 def capture(results: dict[str, Any]) -> list[str]:
@@ -109,7 +135,7 @@ def curate(results: dict[str, Any]) -> list[str]:
     ]  # fmt: skip
 
 
-SECTIONS = {"demo": demo, "denoise": denoise, "capture": capture, "curate": curate}
+SECTIONS = {"demo": demo, "denoise": denoise, "capture": capture, "statistics": statistics, "curate": curate}
 
 
 def section(root: Path = ROOT) -> str:
