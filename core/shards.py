@@ -27,6 +27,7 @@ VOXELS = RESOLUTION**3
 SURROUNDINGS_RESOLUTION = 16
 SURROUNDINGS_EDGE = 3.0  # edges of the cube
 MAX_VIEW_COUNT = 255
+TRANSMITTANCE_RESOLUTION = 16
 FRAME_NUMBERS = 13
 NO_SOURCE = -1
 Layout = dict[str, tuple[tuple[int, ...], str]]
@@ -40,6 +41,7 @@ ARRAYS: Layout = {
 OPTIONAL_ARRAYS: Layout = {
     "surroundings": ((SURROUNDINGS_RESOLUTION,) * 3, "uint8"),
     "view_count": ((RESOLUTION,) * 3, "uint8"),
+    "transmittance": ((TRANSMITTANCE_RESOLUTION,) * 3, "uint8"),
     "frames": ((FRAME_NUMBERS,), "float64"),
     "source": ((), "int32"),
 }
@@ -150,7 +152,8 @@ def write_shard(folder: str | Path, arrays: Mapping[str, NDArray[Any]], provenan
             (the scene or mesh a cube came from; nothing of a group may straddle a split).
             Optional: ``surroundings (N, 16, 16, 16) uint8`` (quantised signed opacity, same centre and rotation,
             three times the edge), ``view_count (N, 32, 32, 32) uint8`` (training views that saw a voxel, capped
-            at 255), ``frames (N, 13) float64`` (:func:`pack_frame`), ``source (N,) int32`` (a row of
+            at 255), ``transmittance (N, 16, 16, 16) uint8`` (255 times the share of light that the best training
+            camera gets, see :mod:`.transmittance`), ``frames (N, 13) float64`` (:func:`pack_frame`), ``source (N,) int32`` (a row of
             ``provenance["sources"]``, -1 for none).
         provenance: JSON-able; kept in the manifest.
 
@@ -205,6 +208,7 @@ class Shard:
     provenance: dict[str, Any]
     surroundings: NDArray[np.uint8] | None = None
     view_count: NDArray[np.uint8] | None = None
+    transmittance: NDArray[np.uint8] | None = None
     frames: NDArray[np.float64] | None = None
     source: NDArray[np.int32] | None = None
 

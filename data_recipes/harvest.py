@@ -23,6 +23,7 @@ from ..core.aabb import scene_extent
 from ..core.frames import RESOLUTION, CubeFrame, cube_lattices, random_rotations
 from ..core.occupancy import DEFAULT_OPACITY_THRESHOLD, opacity_from_density, opacity_from_signed
 from ..core.shards import (
+    TRANSMITTANCE_RESOLUTION,
     dequantize_signed,
     pack_labels,
     quantize_signed,
@@ -30,6 +31,7 @@ from ..core.shards import (
     unpack_labels,
     write_shard,
 )
+from ..core.transmittance import TransmittanceMaps
 from .harvest_config import HarvestConfig
 from .harvest_context import count_views, signed_opacity, surroundings
 from .harvest_labels import Labeller, Truth, check_fit, severity_of
@@ -81,6 +83,7 @@ def harvest_cubes(
     rotations[rng.random(count) >= config.rotated_share] = np.eye(3)
     assumed_pitch = field.field_pitch * np.exp(rng.uniform(-0.3, 0.3, size=count))
     density_fn = _density_fn(field)
+    maps = TransmittanceMaps.build(density_fn, truth.cameras, aabb=field.aabb, field_pitch=field.field_pitch)
     parts: list[dict[str, NDArray[Any]]] = []
     for start in range(0, count, TOGETHER):
         some = slice(start, start + TOGETHER)
@@ -89,6 +92,7 @@ def harvest_cubes(
         inputs = signed_opacity(density_fn, lattice, assumed_pitch[some], field.aabb)
         opaque = opacity_from_signed(inputs) > DEFAULT_OPACITY_THRESHOLD
         labels = truth.labels(lattice, field.field_pitch, opaque)
+        coarse = cube_lattices(*frames, resolution=TRANSMITTANCE_RESOLUTION)
         about = surroundings(density_fn, *frames, assumed_pitch[some], field.aabb)
         parts.append({
             "inputs": quantize_signed(inputs),
@@ -96,6 +100,7 @@ def harvest_cubes(
             "severity": severity_of(inputs, labels),
             "surroundings": quantize_signed(about),
             "view_count": count_views(truth.cameras, *frames),
+            "transmittance": np.rint(255 * maps.best_view(coarse)).astype(np.uint8),
         })  # fmt: skip
     arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     arrays["edge_fraction"] = (edges / scene_extent(field.aabb)).astype(np.float32)

@@ -38,7 +38,7 @@ class HarvestConfig:
     steps: tuple[int, int] = (250, 900)
     rays: int = 1152
     objects: tuple[int, int] = (0, 5)
-    cubes: int = 168
+    cubes: int = 240
     voxel_pitch: tuple[float, float] = (0.5, 2.0)
     rotated_share: float = 0.5
     room_pitch: tuple[float, float] = (0.008, 0.05)
