@@ -79,8 +79,8 @@ class TransmittanceMaps:
                 raise ValueError(f"TransmittanceMaps: density must be >= 0, {int((~(density >= 0)).sum())} are not")
             depth = np.cumsum(np.minimum(density * step[index], 1e3), axis=2)
             through[index, ..., 1:] = np.exp(-depth)
-        centers = [pixels.astype(np.float64) + 0.5 for pixels in (columns, rows)]
-        return cls(cameras, *centers, through, step, CLEARANCE * field_pitch)
+        across, down = (pixels.astype(np.float64) + 0.5 for pixels in (columns, rows))
+        return cls(cameras, across, down, through, step, CLEARANCE * field_pitch)
 
     def best_view(self, positions: NDArray[np.floating]) -> NDArray[np.float32]:
         """The largest share of light ``(...)`` in [0, 1] that a camera gets from ``positions (..., 3)``.
