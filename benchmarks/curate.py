@@ -7,7 +7,8 @@ Mesh rows cut cubes of a generated bumpy ball: edges log-uniform, from choosing 
 bits, no corruption. ``mesh/trimesh`` slices the mesh at the six faces of the cube and voxelises the rest, as the
 published pipeline did before its external binary; ``mesh/open3d`` is given the cube's own triangles, found by our
 tree, and pays for its voxel grid alone. ``procedural/every-voxel`` asks the same objects' distance at all voxels.
-Every row says how its cubes agree with ours (``iou``), and ours are compared with the 13 separating axes by the book
+``csg/unghost`` builds boolean trees, cuts 64 cubes out of each and fills some. Every row says how its cubes agree with
+ours (``iou``), and ours are compared with the 13 separating axes by the book, those of solids with winding numbers,
 before anything is timed. ``milliseconds`` is processor time a cube; ``cubes_per_second`` wall time of all workers.
 Writes curate.json and curate.png.
 """
@@ -21,33 +22,40 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import tyro
-from numpy.typing import NDArray
+from curate_ways import (
+    FACES,
+    RECIPE,
+    SEED,
+    TOGETHER,
+    Packed,
+    ball,
+    bumpy_ball,
+    check_meshes,
+    check_solids,
+    every_voxel,
+    generators,
+    our_meshes,
+    our_procedural,
+    our_solids,
+    pack,
+    undilated,
+    with_open3d,
+    with_trimesh,
+)
 
-from unghost.core.frames import RESOLUTION, CubeFrame, unit_lattice
 from unghost.core.results import build_results, write_results
-from unghost.data_recipes import compose
-from unghost.data_recipes.crops import choose_frame, cut_cubes, sample_mesh_cubes
+from unghost.data_recipes.crops import sample_mesh_cubes
 from unghost.data_recipes.meshes import Mesh
-from unghost.data_recipes.recipe import Recipe, load_recipe
-from unghost.data_recipes.voxelize import voxelize_triangles_slowly
+from unghost.data_recipes.recipe import Recipe
 
 ROOT = Path(__file__).resolve().parents[1]
-SEED = 3
-TOGETHER = 16
-FACES = 70_000
 SWEEP_FACES = (1_000, 4_000, 16_000, 70_000, 250_000, 1_000_000)
 SWEEP_EDGES = (0.01, 0.02, 0.04, 0.07, 0.1, 0.2)
-RECIPE = dataclasses.replace(load_recipe("meshes"), edge_fraction=(0.01, 0.1))
-PROCEDURAL = load_recipe("procedural")
-
-Occupancy = NDArray[np.bool_]
-Packed = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -65,126 +73,6 @@ class Options:
     cubes: int = 16_000
     quick: bool = False
     out: Path = ROOT / "docs" / "results"
-
-
-def bumpy_ball(faces: int) -> NDArray[np.float64]:
-    """About ``faces`` triangles ``(F, 3, 3)`` of a ball with bumps: a cube's faces, gridded and blown up."""
-    count = max(1, round(np.sqrt(faces / 12)))
-    axis = np.tan(np.linspace(-np.pi / 4, np.pi / 4, count + 1))
-    u, v = np.meshgrid(axis, axis, indexing="ij")
-    soup = []
-    for side in range(6):
-        sign = 1.0 if side % 2 else -1.0
-        grid = np.roll(np.stack([np.full_like(u, sign), sign * u, v], axis=-1), side // 2, axis=-1)
-        way = grid / np.linalg.norm(grid, axis=-1, keepdims=True)
-        x, y, z = np.moveaxis(way, -1, 0)
-        bumps = 0.12 * np.sin(5 * x) * np.sin(4 * y + 1) + 0.05 * np.sin(17 * x) * np.sin(15 * y) * np.sin(13 * z)
-        points = way * (1.0 + bumps + 0.01 * np.sin(41 * (x + y)) * np.sin(37 * z))[..., None]
-        a, b, c, d = points[:-1, :-1], points[1:, :-1], points[1:, 1:], points[:-1, 1:]
-        soup += [np.stack(corners, axis=-2).reshape(-1, 3, 3) for corners in ((a, b, c), (a, c, d))]
-    return np.concatenate(soup)
-
-
-@lru_cache(maxsize=1)
-def ball(faces: int = FACES) -> Mesh:
-    return Mesh.from_triangles(bumpy_ball(faces))
-
-
-def generators(start: int, stop: int) -> list[np.random.Generator]:
-    return [np.random.default_rng([SEED, index]) for index in range(start, stop)]
-
-
-def pack(occupancy: Occupancy) -> Packed:
-    return np.packbits(occupancy.reshape(len(occupancy), -1), axis=1)
-
-
-def our_meshes(start: int, stop: int) -> Packed:
-    parts = range(start, stop, TOGETHER)
-    return np.concatenate(
-        [pack(sample_mesh_cubes(generators(i, min(i + TOGETHER, stop)), ball(), RECIPE)[0]) for i in parts]
-    )
-
-
-def our_procedural(start: int, stop: int) -> Packed:
-    return np.concatenate([pack(compose.sample_cube(rng, PROCEDURAL)[0][None]) for rng in generators(start, stop)])
-
-
-def every_voxel(start: int, stop: int) -> Packed:
-    """The same objects and cubes, their distance asked at every voxel."""
-
-    def plainly(distance: Any, *, thickness: float, solid: bool) -> Occupancy:
-        values = distance(unit_lattice().reshape(-1, 3)).reshape((RESOLUTION,) * 3)
-        shell = compose.shell_from_distance(values.astype(np.float32), thickness=thickness)
-        return shell | (values < 0) if solid else shell
-
-    kept, compose.shell_in_cube = compose.shell_in_cube, plainly
-    try:
-        return our_procedural(start, stop)
-    finally:
-        compose.shell_in_cube = kept
-
-
-def frames(start: int, stop: int) -> list[CubeFrame]:
-    return [choose_frame(rng, ball(), RECIPE) for rng in generators(start, stop)]
-
-
-def undilated(start: int, stop: int) -> Packed:
-    return pack(cut_cubes(ball(), frames(start, stop)))
-
-
-@lru_cache(maxsize=1)
-def welded_ball() -> Any:
-    """The ball as trimesh holds a mesh read from a file: corners shared."""
-    import trimesh
-
-    return trimesh.Trimesh(**trimesh.triangles.to_kwargs(ball().triangles), process=True)
-
-
-def with_trimesh(start: int, stop: int) -> Packed:
-    import trimesh
-
-    cubes = np.zeros((stop - start,) + (RESOLUTION,) * 3, dtype=bool)
-    for cube, frame in zip(cubes, frames(start, stop)):
-        vertices, faces = np.asarray(welded_ball().vertices), np.asarray(welded_ball().faces)
-        for axis, side in ((axis, side) for axis in range(3) for side in (-1.0, 1.0)):
-            normal = frame.rotation[:, axis] * side
-            origin = frame.center - normal * frame.edge_length / 2
-            vertices, faces = trimesh.intersections.slice_faces_plane(vertices, faces, normal, origin)[:2]
-        if len(faces) == 0:
-            continue
-        lattice = frame.to_local(vertices) * RESOLUTION + (RESOLUTION - 1) / 2  # trimesh's: centres at whole numbers
-        grid = trimesh.Trimesh(lattice, faces, process=False).voxelized(pitch=1.0)
-        index = np.rint(grid.points).astype(int)
-        cube[tuple(index[((index >= 0) & (index < RESOLUTION)).all(axis=1)].T)] = True
-    return pack(cubes)
-
-
-def with_open3d(start: int, stop: int) -> Packed:
-    import open3d
-
-    cubes = np.zeros((stop - start,) + (RESOLUTION,) * 3, dtype=bool)
-    corner = np.full(3, 0.5)
-    for cube, frame in zip(cubes, frames(start, stop)):
-        reach = np.abs(frame.rotation).sum(axis=1) * frame.edge_length / 2
-        rows = ball().tree.touching((frame.center - reach)[None], (frame.center + reach)[None])[1]
-        soup = frame.to_local(ball().triangles[rows]).reshape(-1, 3)
-        mesh = open3d.geometry.TriangleMesh(
-            open3d.utility.Vector3dVector(soup), open3d.utility.Vector3iVector(np.arange(len(soup)).reshape(-1, 3))
-        )
-        grid = open3d.geometry.VoxelGrid.create_from_triangle_mesh_within_bounds(mesh, 1 / RESOLUTION, -corner, corner)
-        index = np.array([voxel.grid_index for voxel in grid.get_voxels()], dtype=np.int64).reshape(-1, 3)
-        cube[tuple(index[((index >= 0) & (index < RESOLUTION)).all(axis=1)].T)] = True  # it goes on beyond its bounds
-    return pack(cubes)
-
-
-def check_meshes(count: int) -> None:
-    """Cubes of the ball, of few triangles and of many, against the 13 axes; a batch against one by one."""
-    drawn = sorted(frames(0, 40 * count), key=lambda frame: frame.edge_length)[::40][:count]
-    for cube, frame in zip(cut_cubes(ball(), drawn), drawn):
-        reach = np.full((1, 3), frame.edge_length)
-        rows = ball().tree.touching(frame.center - reach, frame.center + reach)[1]
-        assert np.array_equal(cube, voxelize_triangles_slowly(frame.to_local(ball().triangles[rows])))
-        assert np.array_equal(cube, cut_cubes(ball(), [frame])[0])
 
 
 def agreement(found: Packed, expected: Packed) -> float:
@@ -221,6 +109,7 @@ CONTENDERS = (
     Contender("mesh/open3d", with_open3d, 0.01, undilated, 0.95, FACES),
     Contender("procedural/unghost", our_procedural, 1.0, our_procedural, 1.0),
     Contender("procedural/every-voxel", every_voxel, 0.1, our_procedural, 0.9999),
+    Contender("csg/unghost", our_solids, 0.25, our_solids, 1.0),
 )
 
 
@@ -301,6 +190,7 @@ def main(options: Options) -> list[dict[str, Any]]:
     if options.quick:
         options = dataclasses.replace(options, cubes=options.cubes // 10)
     check_meshes(6 if options.quick else 24)
+    check_solids(4 if options.quick else 16)
     rows = [measure(contender, options) for contender in CONTENDERS]
     rows += sweeps(options, max(TOGETHER, options.cubes // 16))
     command = "python benchmarks/curate.py" + " --quick" * options.quick + f" --workers {options.workers}"

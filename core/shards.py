@@ -48,17 +48,25 @@ OPTIONAL_ARRAYS: Layout = {
 
 
 def pack_labels(labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """``(N, R, R, R)`` labels 0, 1, 2 to ``(N, R^3 / 4)`` bytes; the first voxel is in the lowest two bits."""
-    if labels.size and labels.max() > IGNORE_LABEL:
-        raise ValueError(f"pack_labels: labels must be 0, 1 or 2, got {labels.max()}")
-    quads = labels.reshape(len(labels), -1, 4).astype(np.uint8)
+    """``(N, R, R, R)`` labels 0, 1, 2 to ``(N, R^3 / 4)`` bytes; the first voxel is in the lowest two bits.
+
+    Args:
+        labels: N may be 0; R must be even.
+    """
+    if labels.ndim != 4 or np.prod(labels.shape[1:]) % 4:
+        raise ValueError(f"pack_labels: labels must have shape (N, R, R, R) with an even R, got {labels.shape}")
+    if labels.size and not 0 <= labels.min() <= labels.max() <= IGNORE_LABEL:
+        raise ValueError(f"pack_labels: labels must be 0, 1 or 2, got {labels.min()} to {labels.max()}")
+    quads = labels.astype(np.uint8).reshape(len(labels), int(np.prod(labels.shape[1:])) // 4, 4)
     return (quads * np.array([1, 4, 16, 64], dtype=np.uint8)).sum(axis=-1, dtype=np.uint8)
 
 
 def unpack_labels(packed: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Inverse of :func:`pack_labels`."""
+    """Inverse of :func:`pack_labels`: ``(N, 8192)`` bytes to ``(N, 32, 32, 32)``; N may be 0."""
+    if packed.ndim != 2 or packed.shape[1] != VOXELS // 4:
+        raise ValueError(f"unpack_labels: packed must have shape (N, {VOXELS // 4}), got {packed.shape}")
     quads = np.stack([packed & 3, packed >> 2 & 3, packed >> 4 & 3, packed >> 6], axis=-1)
-    return quads.reshape(-1, RESOLUTION, RESOLUTION, RESOLUTION)
+    return quads.reshape(len(packed), RESOLUTION, RESOLUTION, RESOLUTION)
 
 
 def quantize_signed(signed: NDArray[np.floating]) -> NDArray[np.uint8]:
@@ -136,6 +144,16 @@ def _check_sources(source: NDArray[np.int32], provenance: Mapping[str, Any], whe
 
 
 def _check_values(arrays: Mapping[str, NDArray[Any]], provenance: Mapping[str, Any], where: str) -> None:
+    """The rules that values must obey, for those of the arrays that are given."""
+    if "labels" in arrays and (arrays["labels"] & arrays["labels"] >> 1 & 0x55).any():
+        raise ValueError(f"{where}: labels must be 0, 1 or 2, got 3")
+    severity, fraction = arrays.get("severity", np.ones(1)), arrays.get("edge_fraction", np.ones(1))
+    for name, values, good, rule in (
+        ("severity", severity, (severity >= 0) & (severity <= 1), "lie in [0, 1]"),
+        ("edge_fraction", fraction, (fraction > 0) & (fraction < np.inf), "be finite and > 0"),
+    ):
+        if not good.all():
+            raise ValueError(f"{where}: {name} must {rule}, got {values[~good][0]}")
     if "frames" in arrays:
         _check_frames(arrays["frames"], where)
     if "source" in arrays:

@@ -264,15 +264,16 @@ def draw_offset(rng: np.random.Generator, recipe: Recipe, normal: Array) -> Arra
     return normal * side * rng.uniform(0.5, 0.85)
 
 
-def sample_cube(rng: np.random.Generator, recipe: Recipe) -> tuple[Occupancy, float]:
+def sample_cube(rng: np.random.Generator, recipe: Recipe) -> tuple[Occupancy, float, CubeFrame | None]:
     """One clean procedural cube.
 
     Returns:
-        ``occupancy (32, 32, 32)`` bool and the cube's edge over the object's extent.
+        ``occupancy (32, 32, 32)`` bool, the cube's edge over the object's extent, and where the cube lay in the
+        coordinates of its object; None for a cube that is empty by choice, for which no object was composed.
     """
     fraction = log_uniform(rng, *recipe.edge_fraction)
     if rng.random() < recipe.empty_share:
-        return np.zeros((RESOLUTION,) * 3, dtype=bool), fraction
+        return np.zeros((RESOLUTION,) * 3, dtype=bool), fraction, None
     composed = compose_object(rng, recipe)
     point, normal = surface_point(rng, composed)
     edge = fraction * composed.extent
@@ -281,6 +282,6 @@ def sample_cube(rng: np.random.Generator, recipe: Recipe) -> tuple[Occupancy, fl
     visible = composed.near(center, edge * _BALL_RADIUS).seen_from(frame)
     thickness, solid = float(rng.uniform(*recipe.shell_thickness)), bool(rng.random() < recipe.solid_share)
     if not visible.parts:
-        return np.zeros((RESOLUTION,) * 3, dtype=bool), fraction
+        return np.zeros((RESOLUTION,) * 3, dtype=bool), fraction, frame
     occupancy = shell_in_cube(visible.distance, thickness=thickness, solid=solid)
-    return random_dilation(rng, occupancy, recipe.max_dilation), fraction
+    return random_dilation(rng, occupancy, recipe.max_dilation), fraction, frame

@@ -27,7 +27,7 @@ Array = NDArray[Any]
 Occupancy = NDArray[np.bool_]
 
 _LEAST_VOLUME = 1e-4  # of the volume of the tree's first leaf
-_STREAM = 0x637367  # keeps the trees apart from the samples' own generators
+STREAM = 0x637367  # keeps the trees apart from the samples' own generators
 
 
 @dataclass(frozen=True)
@@ -216,7 +216,7 @@ def sample_csg_cubes(
 
 @lru_cache(maxsize=4)
 def _mesh_at(seed: int, number: int, settings: CsgSettings) -> ClosedMesh:
-    return ClosedMesh.from_solid(random_solid(np.random.default_rng([seed, number, _STREAM]), settings))
+    return ClosedMesh.from_solid(random_solid(np.random.default_rng([seed, number, STREAM]), settings))
 
 
 def csg_cubes_at(
@@ -225,8 +225,11 @@ def csg_cubes_at(
     indices: Sequence[int],
     seed: int,
     settings: CsgSettings | None = None,
-) -> list[tuple[Occupancy, float, int]]:
-    """The clean cubes of samples ``indices``: occupancy, edge fraction, and the number of their tree (the group).
+) -> list[tuple[Occupancy, CubeFrame, int]]:
+    """The clean cubes of samples ``indices``: occupancy, where they lay, and the number of their tree (the group).
+
+    They lie in the coordinates of their solid, normalised as :class:`ClosedMesh` has it, where an edge length is an
+    edge fraction.
 
     ``recipe.cubes_per_mesh`` consecutive samples share a tree, which depends on the seed and its number alone.
     """
@@ -234,6 +237,6 @@ def csg_cubes_at(
     for number, group in itertools.groupby(indices, key=lambda index: index // recipe.cubes_per_mesh):
         stop = start + len(list(group))
         occupancy, frames = sample_csg_cubes(rngs[start:stop], _mesh_at(seed, number, settings), recipe)
-        found += [(cube, frame.edge_length, number) for cube, frame in zip(occupancy, frames)]
+        found += [(cube, frame, number) for cube, frame in zip(occupancy, frames)]
         start = stop
     return found

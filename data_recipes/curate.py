@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from tqdm import tqdm
 
 from ..core.shards import read_shard, write_shard
 from .engines import WorkerDied, open_engine, spans
+from .folder_lock import locked
 from .pairs import Arrays, Chunk, Notes, SampleError, checked_root, close_meshes, damage, make_chunk, sample_pair
 from .recipe import Recipe
 
@@ -35,12 +37,15 @@ class _Plan:
         """The provenance of the shard if it is there, whole and the one wanted; another one there is an error."""
         if not self.folder.exists():
             return None
-        found = read_shard(self.folder, verify=True).provenance
-        differing = sorted(key for key, value in self.provenance.items() if found.get(key) != value)
+        shard = read_shard(self.folder, verify=True)
+        there = _flat(shard.provenance | {"count": len(shard), "frames": shard.frames is not None})
+        wanted = _flat(self.provenance | {"count": self.stop - self.start, "frames": True})
+        differing = [f"{key}: {there.get(key)!r:.80}, not {value!r:.80}" for key, value in sorted(wanted.items())
+                     if there.get(key) != value]  # fmt: skip
         if differing:
-            raise ValueError(f"curate: {self.folder} holds another curation (it differs in {', '.join(differing)}): "
+            raise ValueError(f"curate: {self.folder} holds another curation ({'; '.join(differing)}): "
                              "choose another out folder or remove it")  # fmt: skip
-        return found
+        return shard.provenance
 
     def write(self, chunks: Iterator[Chunk], bar: tqdm[Any]) -> dict[str, Any]:
         """Collect the shard's chunks and write it; its provenance."""
@@ -69,9 +74,20 @@ class _Plan:
         return provenance
 
 
+def _flat(provenance: dict[str, Any]) -> dict[str, Any]:
+    """The entries, those of the recipe one by one."""
+    recipe = provenance.get("recipe")
+    inner = (
+        {f"recipe.{key}": value for key, value in recipe.items()} if isinstance(recipe, dict) else {"recipe": recipe}
+    )
+    return {key: value for key, value in provenance.items() if key != "recipe"} | inner
+
+
 def _plans(recipe: Recipe, folder: Path, count: int, seed: int, root: str | None, shard_length: int) -> list[_Plan]:
     base: dict[str, Any] = {"recipe": recipe.to_dict(), "seed": seed}
-    if root is not None:
+    if root is None:
+        base["licence"] = "generated"
+    else:
         from .mesh_sources import open_library
 
         library = open_library(recipe, root)
@@ -97,9 +113,10 @@ def curate(
 ) -> list[Path]:
     """Write ``count`` pairs as shards ``out/shard-00000``, ... of up to ``shard_length`` each.
 
-    A finished shard is skipped once its hashes are checked, an unfinished one is made anew, so a killed run
-    continues where it was, less at most one shard. A mesh that cannot be used costs that mesh: another one takes
-    its samples, and the shard's provenance says so.
+    A finished shard is skipped once its hashes are checked, an unfinished one is made anew, so that a killed run goes
+    on to the same bytes: what it loses is the shard it was at, and what its workers had made ahead (at most 512 pairs
+    each). A second run in the same folder at the same time is refused (:mod:`.folder_lock`). A mesh that cannot be
+    used costs that mesh: another one takes its samples, and the shard's provenance says so.
 
     Args:
         recipe: see :class:`Recipe`.
@@ -121,7 +138,8 @@ def curate(
         ValueError: a number out of range, an unknown engine, no ``mesh_root`` where one is needed, or shards of
             another recipe or seed, or damaged ones, in ``out``.
         SampleError: a pair could not be made (a ValueError too).
-        OSError: a shard cannot be written; the finished ones stay. :class:`.engines.WorkerDied` is one.
+        OSError: a shard cannot be written; the finished ones stay. :class:`.engines.WorkerDied` is one, and
+            ``BlockingIOError``: another run is at work in ``out``.
 
     Example:
         >>> from unghost.data_recipes.recipe import load_recipe
@@ -130,20 +148,23 @@ def curate(
     _check_numbers(count=(count, 1), seed=(seed, 0), workers=(workers, 1), shard_length=(shard_length, 1))
     opened, root = open_engine(engine, workers), checked_root(recipe, mesh_root)
     plans = _plans(recipe, Path(out), count, seed, root, shard_length)
-    found = [plan.finished() for plan in plans]
-    todo = [plan for plan, provenance in zip(plans, found) if provenance is None]
-    left = sum(plan.stop - plan.start for plan in todo)
-    length = CHUNK_LENGTH if left >= 4 * CHUNK_LENGTH * workers else max(8, left // (4 * workers))
-    tasks = ((recipe, seed, root, *span) for plan in todo for span in spans(plan.start, plan.stop, length))
-    made: list[dict[str, Any]] = []
-    if todo:
-        with opened, tqdm(total=count, initial=count - left, unit="cube", disable=not progress, smoothing=0.05) as bar:
-            chunks = opened.ordered(make_chunk, tasks)
-            try:
-                _write(todo, chunks, bar, made, wanted=len(plans))
-            finally:
-                chunks.close()
-                close_meshes(root)
+    with locked(out, verb="curate"):
+        found = [plan.finished() for plan in plans]
+        todo = [plan for plan, provenance in zip(plans, found) if provenance is None]
+        left = sum(plan.stop - plan.start for plan in todo)
+        length = CHUNK_LENGTH if left >= 4 * CHUNK_LENGTH * workers else max(8, left // (4 * workers))
+        tasks = ((recipe, seed, root, *span) for plan in todo for span in spans(plan.start, plan.stop, length))
+        made: list[dict[str, Any]] = []
+        if todo:
+            with (
+                opened,
+                tqdm(total=count, initial=count - left, unit="cube", disable=not progress, smoothing=0.05) as bar,
+                closing(opened.ordered(make_chunk, tasks)) as chunks,
+            ):
+                try:
+                    _write(todo, chunks, bar, made, wanted=len(plans))
+                finally:
+                    close_meshes(root)
     if log is not None:
         _report(log, [provenance for provenance in (*found, *made) if provenance is not None])
     return [plan.folder for plan in plans]

@@ -74,14 +74,19 @@ def _end_with_parent() -> None:
 
 
 class LocalEngine:
-    """This process (``workers=1``) or a pool of spawned ones.
+    """This process (``workers=1``) or a pool of spawned ones, which end with it, however it ends.
 
     A script that asks for more than one needs the usual ``if __name__ == "__main__"``.
+
+    Args:
+        workers: >= 1.
+        ahead: calls that are under way or done before their turn, at most; twice the workers unless told.
+        apart: spawn one worker, too, rather than make its calls in this process.
     """
 
-    def __init__(self, workers: int, *, ahead: int | None = None) -> None:
+    def __init__(self, workers: int, *, ahead: int | None = None, apart: bool = False) -> None:
         _check_workers(workers)
-        self.workers = workers
+        self.workers, self.spawns = workers, apart or workers > 1
         self.ahead = 2 * workers if ahead is None else max(1, ahead)
         self._pool: ProcessPoolExecutor | None = None
 
@@ -91,10 +96,13 @@ class LocalEngine:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._end_pool()
+        self._end_pool(now=kind is not None and not issubclass(kind, GeneratorExit))
 
-    def _end_pool(self) -> None:
+    def _end_pool(self, *, now: bool = False) -> None:
+        """``now`` ends calls that are under way, too: after an interrupt nobody waits for them."""
         if self._pool is not None:
+            for process in list((getattr(self._pool, "_processes", None) or {}).values()) if now else ():
+                process.terminate()
             self._pool.shutdown(wait=True, cancel_futures=True)
             self._pool = None
 
@@ -107,7 +115,7 @@ class LocalEngine:
 
     def ordered(self, call: Callable[..., Result], tasks: Iterable[Task]) -> Generator[Result, None, None]:
         """See :meth:`Engine.ordered`."""
-        if self.workers == 1:
+        if not self.spawns:
             yield from itertools.starmap(call, tasks)
             return
         source = iter(tasks)

@@ -11,8 +11,7 @@ import dataclasses
 import os
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,9 +31,12 @@ from ..core.shards import (
     write_shard,
 )
 from ..core.transmittance import TransmittanceMaps
+from .engines import LocalEngine
+from .folder_lock import locked
 from .harvest_config import HarvestConfig
 from .harvest_context import count_views, signed_opacity, surroundings
 from .harvest_labels import Labeller, Truth, check_fit, severity_of
+from .harvest_resume import finished, scene_folder
 
 if TYPE_CHECKING:
     from ..core.sampled_distance import SampledDistance
@@ -235,6 +237,10 @@ def room_scene(
 def _work(
     folder: str, seed: int, index: int, config: HarvestConfig, fit: bool, mesh_root: str | None
 ) -> tuple[int, str]:
+    """Harvest a scene into its shard, unless it is there; its number, and why it was given up or nothing."""
+    target = scene_folder(folder, index)
+    if target.exists():  # made by a call whose answer was lost with another worker
+        return index, ""
     try:
         if fit:
             import torch
@@ -243,7 +249,7 @@ def _work(
         arrays, provenance = (harvest_scene if fit else room_scene)(seed, index, config, mesh_root)
     except (RuntimeError, FloatingPointError) as error:  # no free path, a failed fit: reported, not fatal
         return index, str(error)
-    write_shard(Path(folder) / f"scene-{index:05d}", arrays, provenance)
+    write_shard(target, arrays, provenance)
     return index, ""
 
 
@@ -260,35 +266,41 @@ def harvest(
     progress: bool = False,
     log: Callable[[str], None] | None = None,
 ) -> int:
-    """Harvest scenes ``first .. first + scenes - 1``, one shard each; those already there are skipped.
+    """Harvest scenes ``first .. first + scenes - 1``, one shard each; those already there are checked and skipped.
 
-    A run can be killed at any time and started again. Without ``fit``, cubes are of perfect fields with synthetic
-    corruption (:func:`room_scene`): quick, and needs no torch. ``log`` hears of scenes that were given up.
-    ``mesh_root`` is a folder of meshes with its manifest, for objects beside the procedural ones.
+    A run can be killed at any time and started again: it loses the scenes that it was at, one a worker. A worker that
+    dies costs the same. A second run in the same folder at the same time is refused (:mod:`.folder_lock`). Without
+    ``fit``, cubes are of perfect fields with synthetic corruption (:func:`room_scene`): quick, and needs no torch.
+    ``log`` hears of scenes that were given up. ``mesh_root`` is a folder of meshes with its manifest, for objects
+    beside the procedural ones.
 
     Returns:
         The number of pairs now in ``out``.
+
+    Raises:
+        ValueError: numbers out of range, or a scene in ``out`` that is damaged or another harvest's.
+        OSError: a scene cannot be written; the finished ones stay. ``BlockingIOError``: another run is at work there.
     """
     from tqdm import tqdm
 
     folder, config = Path(out), config or HarvestConfig()
     if scenes < 1 or workers < 1:
         raise ValueError(f"harvest: scenes and workers must be >= 1, got {scenes} and {workers}")
-    folder.mkdir(parents=True, exist_ok=True)
-    todo = [index for index in range(first, first + scenes) if not (folder / f"scene-{index:05d}").exists()]
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     started = time.perf_counter()
     root = None if mesh_root is None else str(mesh_root)
-    with (
-        ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool,
-        tqdm(total=len(todo), disable=not progress, unit="scene") as bar,
-    ):
-        for index, problem in (
-            pool.map(_work, *zip(*((str(folder), seed, index, config, fit, root) for index in todo))) if todo else ()
+    with locked(folder, verb="harvest"):
+        wanted = range(first, first + scenes)
+        todo = [i for i in wanted if not finished(folder, seed, i, config, fit=fit, meshes=root is not None)]
+        with (
+            LocalEngine(workers, ahead=len(todo), apart=True) as engine,
+            tqdm(total=len(todo), disable=not progress, unit="scene") as bar,
+            closing(engine.ordered(_work, ((str(folder), seed, i, config, fit, root) for i in todo))) as done,
         ):
-            if problem and log is not None:
-                log(f"scene {index}: {problem}")
-            bar.update(1)
+            for index, problem in done:
+                if problem and log is not None:
+                    log(f"scene {index}: {problem}")
+                bar.update(1)
     if log is not None:
         log(f"{len(todo)} scenes in {time.perf_counter() - started:.0f} s")
     return sum(len(read_shard(path)) for path in sorted(folder.glob("scene-*")) if path.suffix != ".partial")

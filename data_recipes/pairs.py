@@ -36,8 +36,8 @@ class CleanCube:
     rng: np.random.Generator
     occupancy: NDArray[np.bool_]
     fraction: float
+    frame: CubeFrame | None
     group: int
-    frame: CubeFrame | None = None
 
 
 @dataclass(frozen=True)
@@ -61,12 +61,14 @@ def _clean_cubes(
         from .csg import csg_cubes_at
 
         exact = csg_cubes_at(rngs, recipe, indices, seed)
-        return [CleanCube(rng, *cube) for rng, cube in zip(rngs, exact)], set()
+        return [
+            CleanCube(rng, cube, frame.edge_length, frame, group) for rng, (cube, frame, group) in zip(rngs, exact)
+        ], set()
     from .mesh_sources import open_library
 
     assert mesh_root is not None
     cubes, passed = open_library(recipe, mesh_root).draw(rngs, indices, seed=seed)
-    return [CleanCube(rng, c.occupancy, c.frame.edge_length, c.row, c.frame) for rng, c in zip(rngs, cubes)], passed
+    return [CleanCube(rng, c.occupancy, c.frame.edge_length, c.frame, c.row) for rng, c in zip(rngs, cubes)], passed
 
 
 def damage(
@@ -141,8 +143,7 @@ def _fill(
         arrays["inputs"][row] = quantize_signed(signed)
         arrays["labels"][row] = pack_labels(labels[None])[0]
         arrays["edge_fraction"][row], arrays["group"][row] = clean.fraction, clean.group
-        if "frames" in arrays:
-            arrays["frames"][row] = pack_frame(clean.frame)
+        arrays["frames"][row] = pack_frame(clean.frame)
     return passed
 
 
@@ -155,14 +156,13 @@ def _named(arrays: Arrays, first: int, recipe: Recipe, index: int, seed: int, me
 
 
 def make_chunk(recipe: Recipe, seed: int, mesh_root: str | None, start: int, stop: int) -> Chunk:
-    """Samples ``start`` to ``stop`` in the layout of a shard, with ``frames`` if they are cut from meshes.
+    """Samples ``start`` to ``stop`` in the layout of a shard, with ``frames``.
 
     Raises:
         SampleError: one of them could not be made.
         ImportError: a missing extra.
     """
-    names = [*ARRAYS, "frames"] if recipe.source == "meshes" else list(ARRAYS)
-    layout = {name: (ARRAYS | OPTIONAL_ARRAYS)[name] for name in names}
+    layout = ARRAYS | {"frames": OPTIONAL_ARRAYS["frames"]}
     arrays: Arrays = {name: np.empty((stop - start, *shape), dtype) for name, (shape, dtype) in layout.items()}
     passed: set[int] = set()
     for low, high in spans(start, stop, CUT_TOGETHER):

@@ -111,7 +111,7 @@ def sources_of(shard: Shard) -> Counter[tuple[str, str]]:
     name = str(recipe.get("name", "unknown")) if isinstance(recipe, dict) else str(recipe)
     stated = provenance.get("licence")
     if stated is None and isinstance(recipe, dict):
-        made = recipe.get("source") == "procedural"
+        made = recipe.get("source") != "meshes"  # of shards that state no licence
         stated = "generated" if made else "any of " + ", ".join(map(str, recipe.get("licences", ["unknown"])))
     whole = name, str(stated or "unknown")
     rows = shard.source

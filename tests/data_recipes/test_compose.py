@@ -17,6 +17,7 @@ from unghost.data_recipes.compose import (
     shell_from_distance,
     surface_point,
 )
+from unghost.data_recipes.narrow_band import shell_in_cube
 from unghost.data_recipes.recipe import Recipe
 
 RECIPE = Recipe()
@@ -155,9 +156,9 @@ def test_sample_depends_on_its_generator_alone():
 
 def test_cubes_are_varied_and_within_the_recipe():
     drawn = [sample_cube(np.random.default_rng([1, i]), RECIPE) for i in range(250)]
-    counts = np.array([occupancy.sum() for occupancy, _ in drawn])
-    fractions = np.array([fraction for _, fraction in drawn])
-    assert all(occupancy.shape == (32, 32, 32) and occupancy.dtype == bool for occupancy, _ in drawn)
+    counts = np.array([occupancy.sum() for occupancy, _, _ in drawn])
+    fractions = np.array([fraction for _, fraction, _ in drawn])
+    assert all(occupancy.shape == (32, 32, 32) and occupancy.dtype == bool for occupancy, _, _ in drawn)
     assert fractions.min() >= 0.01
     assert fractions.max() <= 0.2
     assert np.median(np.log(fractions)) == pytest.approx(np.log(0.01 * 0.2) / 2, abs=0.3)
@@ -167,13 +168,33 @@ def test_cubes_are_varied_and_within_the_recipe():
     assert 1000 < np.median(counts) < 6000
 
 
+def test_a_cube_says_where_in_its_object_it_lies():
+    recipe = dataclasses.replace(RECIPE, max_dilation=0, solid_share=0.0, shell_thickness=(1.0, 1.0))
+    filled = 0
+    for index in range(40):
+        occupancy, fraction, frame = sample_cube(np.random.default_rng([2, index]), recipe)
+        rng = np.random.default_rng([2, index])
+        rng.random(2)  # the edge fraction, and whether the cube is empty
+        if frame is None:
+            assert not occupancy.any()
+            continue
+        composed = compose_object(rng, recipe)
+        assert frame.edge_length == fraction * composed.extent
+        again = shell_in_cube(composed.seen_from(frame).distance, thickness=1.0, solid=False)
+        assert (again != occupancy).mean() < 1e-4  # parts that only fillets reach are left out of a sample
+        filled += bool(occupancy.any())
+    assert filled > 25
+
+
 def test_shares_of_one_and_zero():
     for i in range(10):
-        assert not sample_cube(np.random.default_rng(i), dataclasses.replace(RECIPE, empty_share=1.0))[0].any()
+        empty, _, frame = sample_cube(np.random.default_rng(i), dataclasses.replace(RECIPE, empty_share=1.0))
+        assert not empty.any()
+        assert frame is None
     wall = dataclasses.replace(RECIPE, families=("ball",), parts=(1, 1), empty_share=0.0, on_share=1.0, near_share=0.0,
                                max_dilation=0, hollow_share=0.0, bumpy_share=0.0, center_jitter=0.0)  # fmt: skip
     for i in range(10):
-        thin, _ = sample_cube(np.random.default_rng(i), dataclasses.replace(wall, solid_share=0.0))
-        full, _ = sample_cube(np.random.default_rng(i), dataclasses.replace(wall, solid_share=1.0))
+        thin, _, _ = sample_cube(np.random.default_rng(i), dataclasses.replace(wall, solid_share=0.0))
+        full, _, _ = sample_cube(np.random.default_rng(i), dataclasses.replace(wall, solid_share=1.0))
         assert (full >= thin).all()
         assert thin.sum() < 4000 < full.sum()

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from unghost.core.frames import CubeFrame
+from unghost.core.shards import pack_frame
 from unghost.data_recipes import csg
 from unghost.data_recipes.crops import cut_cubes
 from unghost.data_recipes.csg import (
@@ -76,9 +77,10 @@ def test_samples_of_a_batch_equal_samples_alone_and_share_trees_in_runs():
     batch = csg_cubes_at(generators(indices), RECIPE, indices, seed=2)
     assert [group for _, _, group in batch] == [0, 0, 0, 1, 1, 1, 2, 2]
     for index in indices:
-        ((alone, fraction, group),) = csg_cubes_at(generators([index]), RECIPE, [index], seed=2)
+        ((alone, frame, group),) = csg_cubes_at(generators([index]), RECIPE, [index], seed=2)
         np.testing.assert_array_equal(alone, batch[index][0])
-        assert (fraction, group) == batch[index][1:]
+        np.testing.assert_array_equal(pack_frame(frame), pack_frame(batch[index][1]))
+        assert group == batch[index][2]
 
 
 def test_solid_share_fills_and_never_takes_away():

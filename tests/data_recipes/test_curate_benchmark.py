@@ -14,9 +14,10 @@ BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 @pytest.fixture
 def bench(monkeypatch):
     monkeypatch.syspath_prepend(str(BENCHMARKS))
-    module = importlib.import_module("curate")
+    module, ways = importlib.import_module("curate"), importlib.import_module("curate_ways")
     small = module.Mesh.from_triangles(module.bumpy_ball(2000))
-    monkeypatch.setattr(module, "ball", lambda faces=0: small)
+    for each in (module, ways):
+        monkeypatch.setattr(each, "ball", lambda faces=0: small)
     return module
 
 
@@ -31,9 +32,30 @@ def test_the_ball_is_closed_and_has_about_the_faces_asked_for(bench):
 
 def test_our_cubes_are_checked_and_a_wrong_one_is_found(bench, monkeypatch):
     bench.check_meshes(2)
-    monkeypatch.setattr(bench, "cut_cubes", lambda mesh, frames: np.ones((len(frames), 32, 32, 32), dtype=bool))
+    ways = importlib.import_module("curate_ways")
+    monkeypatch.setattr(ways, "cut_cubes", lambda mesh, frames: np.ones((len(frames), 32, 32, 32), dtype=bool))
     with pytest.raises(AssertionError):
         bench.check_meshes(1)
+
+
+def test_solids_are_checked_and_wrong_ones_are_found(bench, monkeypatch):
+    pytest.importorskip("manifold3d")
+    csg = importlib.import_module("curate_ways").csg
+    bench.check_solids(2)
+    for name, wrong in (
+        ("cut_cubes", lambda mesh, frames: np.zeros((len(frames), 32, 32, 32), dtype=bool)),
+        ("fill_solid", lambda triangles, frame, surface: np.ones_like(surface)),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(csg, name, wrong)
+            with pytest.raises(AssertionError):
+                bench.check_solids(2)
+
+
+def test_winding_numbers_by_hand(bench):
+    ways = importlib.import_module("curate_ways")
+    points = np.array([[0.0, 0.0, 0.0], [0.5, 0.3, -0.2], [3.0, 0.0, 0.0]])
+    np.testing.assert_allclose(ways.winding_numbers(bench.bumpy_ball(1200), points), [1, 1, 0], atol=1e-9)
 
 
 def test_agreement_by_hand(bench):
@@ -43,12 +65,14 @@ def test_agreement_by_hand(bench):
     assert bench.agreement(np.packbits(a, axis=1), np.packbits(b, axis=1)) == pytest.approx((1 / 3 + 1) / 2)
 
 
-@pytest.mark.parametrize("number", range(5))
+@pytest.mark.parametrize("number", range(6))
 def test_contenders_make_the_cubes_they_should(bench, number):
     contender = bench.CONTENDERS[number]
     for name in ("trimesh", "open3d"):
         if contender.name.endswith(name):
             pytest.importorskip(name)
+    if contender.name.startswith("csg"):
+        pytest.importorskip("manifold3d")
     count = 8
     found, seconds, peak = bench.timed(contender.method, 0, count)
     expected = np.concatenate([contender.same_as(i, i + 1) for i in range(count)])

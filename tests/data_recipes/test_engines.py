@@ -32,6 +32,9 @@ TASKS = """
         time.sleep(0.05)
         return number
 
+    def endlessly(number):
+        time.sleep(0 if number == 0 else 300)
+
     def die_once(number):
         marker = FOLDER / "died"
         if number == 3 and not marker.exists():
@@ -120,6 +123,26 @@ def test_results_come_in_order_from_other_processes(engine, tasks):
 def test_one_local_worker_is_this_process(tasks):
     with open_engine("local", 1) as opened:
         assert {worker for _, worker in opened.ordered(tasks.identity, numbers(3))} == {os.getpid()}
+
+
+def test_one_local_worker_can_be_apart(tasks):
+    with LocalEngine(1, apart=True) as opened, closing(opened.ordered(tasks.identity, numbers(3))) as results:
+        workers = {worker for _, worker in results}
+    assert len(workers) == 1
+    assert os.getpid() not in workers
+
+
+def test_an_interrupt_waits_for_nobody(tasks):
+    def interrupted():
+        with LocalEngine(2) as opened, closing(opened.ordered(tasks.endlessly, numbers())) as results:
+            next(results)
+            raise KeyboardInterrupt
+
+    start = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert time.monotonic() - start < 120
+    assert multiprocessing.active_children() == []
 
 
 def test_endless_work_runs_a_few_tasks_ahead_only(engine, tasks):
