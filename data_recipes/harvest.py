@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.aabb import scene_extent
+from ..core.cube_views import count_views
 from ..core.frames import RESOLUTION, CubeFrame, cube_lattices, random_rotations
 from ..core.occupancy import DEFAULT_OPACITY_THRESHOLD, opacity_from_density, opacity_from_signed
 from ..core.shards import (
@@ -31,7 +32,7 @@ from ..core.shards import (
     write_shard,
 )
 from .harvest_config import HarvestConfig
-from .harvest_context import count_views, signed_opacity, surroundings
+from .harvest_context import signed_opacity, surroundings
 from .harvest_labels import Truth, check_fit, severity_of
 
 if TYPE_CHECKING:

@@ -89,7 +89,8 @@ def _provenance(trainer: Trainer, shards: Sequence[tuple[str | Path, float]], mi
 
 def _manifest(trainer: Trainer, training: dict[str, Any], threshold: float = 0.0) -> Manifest:
     return Manifest(
-        name=trainer.config.name, default_timestep=trainer.config.default_timestep, removal_threshold=threshold,
+        name=trainer.config.name, channels=trainer.config.network.channels,
+        default_timestep=trainer.config.default_timestep, removal_threshold=threshold,
         parameters=parameter_count(trainer.network), training=training,
     )  # fmt: skip
 
@@ -214,7 +215,9 @@ def train(
     named = dict(validation_shards or {})
     if not set(_threshold_names(config)) <= set(named):
         raise ValueError(f"train: threshold_from {config.threshold_from!r} is not among {sorted(named)}")
-    mixture = Mixture(train_shards, seed=config.seed)
+    mixture = Mixture(
+        train_shards, seed=config.seed, channels=config.network.channels, drop_channels=config.drop_channels
+    )
     validation = {name: read_shard(path) for name, path in named.items()}
     if config.threads:
         torch.set_num_threads(config.threads)

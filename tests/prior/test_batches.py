@@ -62,7 +62,7 @@ def test_timesteps_lie_between_severity_and_the_end(shard_paths):
     mixture = Mixture([(shard_paths["a"], 1.0)], seed=0)
     times = {index: [] for index in range(len(shard))}
     for index in range(400):
-        _, cube, *_ = mixture._draw(index)
+        cube = mixture._draw(index).cube
         times[cube].append(int(mixture.batch(index, 1).timestep[0]))
     for cube, drawn in times.items():
         assert min(drawn) >= np.rint(999 * min(shard.severity[cube], BLIND_SEVERITY))
@@ -73,14 +73,14 @@ def test_timesteps_lie_between_severity_and_the_end(shard_paths):
 
 def test_weights_of_the_mixture(shard_paths):
     mixture = Mixture([(shard_paths["a"], 1.0), (shard_paths["b"], 3.0)], seed=0)
-    share = np.mean([mixture._draw(index)[0] is mixture.shards[1] for index in range(2000)])
+    share = np.mean([mixture._draw(index).shard is mixture.shards[1] for index in range(2000)])
     assert share == pytest.approx(0.75, abs=0.04)
 
 
 def test_values_come_from_the_shard(shard_paths):
     shard = read_shard(shard_paths["b"])
     mixture = Mixture([(shard_paths["b"], 1.0)], seed=0)
-    _, cube, symmetry, *_ = mixture._draw(9)
+    cube, symmetry = mixture._draw(9).cube, mixture._draw(9).symmetry
     batch = mixture.batch(9, 1)
     assert np.array_equal(batch.channels[0, 0], apply_symmetry(dequantize_signed(shard.inputs[cube]), symmetry))
     assert np.array_equal(batch.labels[0], apply_symmetry(unpack_labels(shard.labels[cube : cube + 1])[0], symmetry))

@@ -5,6 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn import functional
 
+from unghost.core.channels import CHANNEL_NAMES
 from unghost.prior.network import (
     SIZES,
     NetworkConfig,
@@ -132,7 +133,10 @@ def test_every_output_depends_on_far_away_input():
 
 
 def test_inputs_unchanged_and_extra_channels_used():
-    network, (cubes, times, edges) = make_network(NetworkConfig(channels=3, widths=(8, 8, 8))), make_inputs(1, 3)
+    network, (cubes, times, edges) = (
+        make_network(NetworkConfig(channels=CHANNEL_NAMES, widths=(8, 8, 8))),
+        make_inputs(1, 3),
+    )
     kept = cubes.clone()
     with torch.no_grad():
         first = network(cubes, times, edges)
@@ -170,7 +174,7 @@ def test_gflop_counts_what_runs():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"channels": 0}, "channels must be >= 1"),
+        ({"channels": ("view_count",)}, "channels must start with"),
         ({"widths": (8, 8)}, "three multiples of 8"),
         ({"widths": (8, 8, 12)}, "three multiples of 8"),
         ({"blocks": (0, 0, 0)}, "not all 0"),
