@@ -8,13 +8,14 @@ import math
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from .channels import CHANNEL_NAMES as CHANNEL_NAMES
+from .channels import check_channels
 from .frames import RESOLUTION
 from .schedule import TIMESTEPS
 
 FORMAT = "unghost-denoiser"
 FORMAT_VERSION = 1
 METADATA_KEY = "unghost_manifest"
-CHANNEL_NAMES = ("signed_opacity", "surroundings", "view_count")
 
 
 @dataclass(frozen=True)
@@ -24,8 +25,8 @@ class Manifest:
     Attributes:
         name: of the model, for people.
         family: ``"restoration"`` (severity as timestep) or ``"diffusion"`` (the paper).
-        channels: input channels in order, each in [-1, 1]; the first is always ``signed_opacity``
-            (a bit is a special case of it).
+        channels: input channels in order, each in [-1, 1] (:mod:`unghost.core.channels`); the first is always
+            ``signed_opacity`` (a bit is a special case of it).
         resolution: voxels along an edge.
         default_timestep: what the regularizer and ``clean`` use unless told.
         removal_threshold: ``x0_pred`` below which ``clean`` is advised to remove; 0 is the paper's rule, by which
@@ -47,13 +48,7 @@ class Manifest:
     training: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "channels", tuple(self.channels))
-        unknown = [name for name in self.channels if name not in CHANNEL_NAMES]
-        if unknown or not self.channels or self.channels[0] != CHANNEL_NAMES[0]:
-            raise ValueError(
-                f"Manifest: channels must start with {CHANNEL_NAMES[0]!r} and be among {CHANNEL_NAMES}, "
-                f"got {self.channels}"
-            )
+        object.__setattr__(self, "channels", check_channels(self.channels, caller="Manifest"))
         if not 0 <= self.default_timestep < TIMESTEPS:
             raise ValueError(f"Manifest: default_timestep must lie in [0, {TIMESTEPS}), got {self.default_timestep}")
         if not (math.isfinite(self.removal_threshold) and -1.0 <= self.removal_threshold <= 1.0):

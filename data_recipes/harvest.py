@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.aabb import scene_extent
+from ..core.cube_views import count_views
 from ..core.frames import RESOLUTION, CubeFrame, cube_lattices, random_rotations
 from ..core.occupancy import DEFAULT_OPACITY_THRESHOLD, opacity_from_density, opacity_from_signed
 from ..core.shards import (
@@ -34,7 +35,7 @@ from ..core.transmittance import TransmittanceMaps
 from .engines import LocalEngine
 from .folder_lock import locked
 from .harvest_config import HarvestConfig
-from .harvest_context import count_views, signed_opacity, surroundings
+from .harvest_context import signed_opacity, surroundings
 from .harvest_labels import Labeller, Truth, check_fit, severity_of
 from .harvest_resume import finished, scene_folder
 

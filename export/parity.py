@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,6 +11,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.channels import (
+    SIGNED_OPACITY,
+    SURROUNDINGS,
+    VIEW_COUNT,
+    coarse_channel,
+    encode_surroundings,
+    encode_view_count,
+    stack_channels,
+)
 from ..core.frames import RESOLUTION, unit_lattice
 from ..core.manifest import Denoiser, Manifest
 from ..core.occupancy import EMPTY, OCCUPIED, occupancy_from_signed, signed_from_opacity
@@ -52,19 +62,34 @@ def _opacity(rng: np.random.Generator, kind: int) -> NDArray[Any]:
     return np.where(rng.random(shape) < 0.01, 1.0, 1e-6)
 
 
-def parity_inputs(cubes: int, seed: int, *, channels: int = 1) -> ParityInputs:
-    """Empty, full, random and structured cubes in turn, with timesteps 0 and 999 and edges 1e-6 to 10 among them."""
+def _beside(rng: np.random.Generator, name: str, kind: int) -> NDArray[np.float32]:
+    """One optional channel of a cube, ``(R, R, R)`` or coarser: views that grow from corner to corner, or opacity."""
+    if name == VIEW_COUNT:
+        return encode_view_count(np.maximum(unit_lattice() @ rng.normal(0, 60, 3) + rng.uniform(0, 60), 0).astype(int))
+    return encode_surroundings(coarse_channel(signed_from_opacity(_opacity(rng, kind))))
+
+
+def parity_inputs(cubes: int, seed: int, *, channels: Sequence[str] = (SIGNED_OPACITY,)) -> ParityInputs:
+    """Empty, full, random and structured cubes in turn, with timesteps 0 and 999 and edges 1e-6 to 10 among them.
+
+    ``channels`` names what the denoiser takes; each optional one is unknown in one cube of four.
+    """
     if cubes < 1:
         raise ValueError(f"parity_inputs: cubes must be >= 1, got {cubes}")
-    values = np.empty((cubes, channels, *(RESOLUTION,) * 3), np.float32)
+    values = np.empty((cubes, len(channels), *(RESOLUTION,) * 3), np.float32)
     times, edges = np.empty(cubes, np.int64), np.empty(cubes, np.float32)
     for index in range(cubes):
         rng = np.random.default_rng([seed, index])
-        for channel in range(channels):
-            values[index, channel] = signed_from_opacity(_opacity(rng, (index + channel) % 8))
+        signed = np.clip(signed_from_opacity(_opacity(rng, index % 8)), EMPTY, OCCUPIED)
         times[index] = (0, TIMESTEPS - 1, int(rng.integers(TIMESTEPS)))[index // 8 % 3]
         edges[index] = (0.05, 1e-6, 10.0, math.exp(rng.uniform(math.log(0.01), 0.0)))[index // 24 % 4]
-    return ParityInputs(np.clip(values, EMPTY, OCCUPIED), times, edges)
+        known = {
+            name: _beside(rng, name, (index + 1) % 8)[None]
+            for place, name in enumerate((SURROUNDINGS, VIEW_COUNT))
+            if name in channels and (index + 2 * place) % 4 != 3
+        }
+        values[index] = stack_channels(channels, signed[None], known)[0]
+    return ParityInputs(values, times, edges)
 
 
 def session_denoiser(body: bytes, manifest: Manifest) -> Denoiser:
@@ -132,5 +157,5 @@ def verify(
         raise ValueError(
             f"verify: {onnx_path} takes {exported.manifest.channels}, {checkpoint_path} {reference.manifest.channels}"
         )
-    inputs = parity_inputs(cubes, seed, channels=len(reference.manifest.channels))
+    inputs = parity_inputs(cubes, seed, channels=reference.manifest.channels)
     return compare(exported, reference, inputs)

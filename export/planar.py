@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from ..core.frames import RESOLUTION
 from ..core.schedule import TIMESTEPS
 from .graph import GraphBuilder
+from .planar_context import planar_context
 
 if TYPE_CHECKING:
     from ..prior.network import RestorationNet
@@ -35,7 +36,7 @@ PAIRS = RESOLUTION // 4  # pairs of 16^3 slices, and slices at 8^3
 
 
 def _activate(graph: GraphBuilder, value: str) -> str:
-    from ..prior.network import LEAK
+    from ..prior.context import LEAK
 
     return graph.node("LeakyRelu", value, alpha=LEAK)
 
@@ -83,8 +84,12 @@ def _up(graph: GraphBuilder, value: str, weight: Weights, bias: Weights) -> str:
     return graph.node("ConvTranspose", *inputs, kernel_shape=[2, 2], strides=[2, 2])
 
 
-def _condition(graph: GraphBuilder, weights: dict[str, Weights], frequencies: int, center: float, spread: float) -> str:
-    """All biases of all blocks, ``(N, sum of widths)``."""
+def _condition(graph: GraphBuilder, weights: dict[str, Weights], pooled: str | None) -> str:
+    """All biases of all blocks, ``(N, sum of widths)``; ``pooled`` is the summary of the surroundings, if any."""
+    from ..prior.network import EDGE_FRACTION_CENTER as center
+    from ..prior.network import EDGE_FRACTION_SPREAD as spread
+    from ..prior.network import FREQUENCIES as frequencies
+
     time = graph.node("Div", graph.node("Cast", "timestep", to=1), graph.constant(TIMESTEPS - 1.0))
     log = graph.node("Log", graph.node("Div", "edge_fraction", graph.constant(center)))
     edge = graph.node("Tanh", graph.node("Div", log, graph.constant(spread)))
@@ -92,8 +97,8 @@ def _condition(graph: GraphBuilder, weights: dict[str, Weights], frequencies: in
     time, edge = (graph.node("Unsqueeze", value, axis) for value in (time, edge))
     waves = graph.constant(math.pi * 2.0 ** np.arange(-1, frequencies - 1)[None])
     angles = graph.node("Concat", graph.node("Mul", time, waves), graph.node("Mul", edge, waves), axis=1)
-    features = graph.node("Concat", time, edge, graph.node("Sin", angles), graph.node("Cos", angles), axis=1)
-    hidden = features
+    summary = [] if pooled is None else [pooled]
+    hidden = graph.node("Concat", time, edge, graph.node("Sin", angles), graph.node("Cos", angles), *summary, axis=1)
     for layer in (0, 2, 4):
         hidden = graph.gemm(hidden, weights[f"condition.{layer}.weight"], weights[f"condition.{layer}.bias"])
         hidden = graph.node("Relu", hidden) if layer < 4 else hidden
@@ -115,19 +120,17 @@ def _block(graph: GraphBuilder, weights: dict[str, Weights], name: str, value: s
     return graph.node("Add", convolve(_activate(graph, shifted), "second", weights[f"{name}.second.bias"]), value)
 
 
-def _stem(graph: GraphBuilder, weights: dict[str, Weights], channels: int) -> str:
-    """Features and first convolution: ``(N * 8, 2 fine, 16, 16)``."""
-    plane = RESOLUTION**2
-    first = "channels"
-    if channels > 1:
-        first, others = graph.node("Split", "channels", graph.constant([1, channels - 1], np.int64), outputs=2, axis=1)
+def _stem(graph: GraphBuilder, weights: dict[str, Weights], names: list[str]) -> str:
+    """Features and first convolution of the aligned channels: ``(N * 8, 2 fine, 16, 16)``."""
+    plane, channels = RESOLUTION**2, len(names)
+    first, others = names[0], names[1:]
     half = graph.constant(0.5)
     opacity = graph.node("Relu", graph.node("Add", graph.node("Mul", first, half), half))
     features = graph.node(
         "Sub", graph.node("Mul", graph.node("Sqrt", opacity), graph.constant(2.0)), graph.constant(1.0)
     )
     if channels > 1:
-        joined = graph.node("Concat", features, others, axis=1)
+        joined = graph.node("Concat", features, *others, axis=1)
         features = graph.node("Transpose", joined, perm=[0, 2, 1, 3, 4])
     stacked = _windows(graph, features, RESOLUTION, channels * plane, range(-2, RESOLUTION - 2, 4), 8)
     stacked = graph.reshape(stacked, -1, 8 * channels, RESOLUTION, RESOLUTION)
@@ -175,13 +178,18 @@ def planar_model(network: RestorationNet) -> Any:
     import onnx
     from onnx.helper import make_tensor_value_info
 
-    from ..prior.network import EDGE_FRACTION_CENTER, EDGE_FRACTION_SPREAD, FREQUENCIES
-
     weights = {name: value.detach().float().cpu().numpy() for name, value in network.state_dict().items()}
     config, graph = network.config, GraphBuilder()
     _, middle_width, coarse_width = config.widths
     down, bottom, up = config.blocks
-    condition = _condition(graph, weights, FREQUENCIES, EDGE_FRACTION_CENTER, EDGE_FRACTION_SPREAD)
+    count, names, beside, pooled = len(config.channels), ["channels"], None, None
+    if count > 1:
+        names = graph.node("Split", "channels", graph.constant([1] * count, np.int64), outputs=count, axis=1)
+    if config.surroundings is not None:
+        beside, pooled = planar_context(
+            graph, weights, names[config.surroundings], stack=_windows, flatten=_flat_kernel, activate=_activate
+        )
+    condition = _condition(graph, weights, pooled)
     depths = [8] * down + [4] * bottom + [8] * up
     widths = [{8: middle_width, 4: coarse_width}[depth] for depth in depths]
     ends = np.cumsum([0, *widths])
@@ -195,8 +203,10 @@ def planar_model(network: RestorationNet) -> Any:
             value = _block(graph, weights, f"blocks.{index}", value, biases[index], depths[index])
         return value
 
-    fine = _stem(graph, weights, config.channels)
+    fine = _stem(graph, weights, [names[index] for index in config.aligned])
     middle = graph.conv(fine, _flat_kernel(weights["down_middle.weight"]), weights["down_middle.bias"], stride=2)
+    if beside is not None:
+        middle = graph.node("Add", middle, beside)
     middle = run(middle, 0, down)
     pairs = graph.reshape(middle, -1, 2 * middle_width, 8, 8)
     coarse = graph.conv(pairs, _flat_kernel(weights["down_coarse.weight"]), weights["down_coarse.bias"], stride=2)
@@ -207,14 +217,11 @@ def planar_model(network: RestorationNet) -> Any:
     lifted = _up(graph, middle, weights["up_fine.mix.weight"], weights["up_fine.bias"])
     fine = _activate(graph, graph.node("Add", fine, lifted))
     out = _head(graph, weights, fine)
-    first = "channels"
-    if config.channels > 1:
-        first = graph.node("Slice", "channels", *(graph.constant([v], np.int64) for v in (0, 1, 1)))
-    logits = graph.node("Add", out, graph.node("Mul", first, graph.constant(weights["gain"])))
+    logits = graph.node("Add", out, graph.node("Mul", names[0], graph.constant(weights["gain"])))
     graph.node("Tanh", graph.node("Mul", logits, graph.constant(0.5)), name="x0_pred")
     cube = (RESOLUTION,) * 3
     inputs = [
-        make_tensor_value_info("channels", onnx.TensorProto.FLOAT, ["N", config.channels, *cube]),
+        make_tensor_value_info("channels", onnx.TensorProto.FLOAT, ["N", count, *cube]),
         make_tensor_value_info("timestep", onnx.TensorProto.INT64, ["N"]),
         make_tensor_value_info("edge_fraction", onnx.TensorProto.FLOAT, ["N"]),
     ]

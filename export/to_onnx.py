@@ -41,7 +41,8 @@ def export_onnx(checkpoint_path: str | Path, out_path: str | Path, *, verify_cub
     if verify_cubes:
         from .parity import compare, parity_inputs, session_denoiser
 
-        report = compare(session_denoiser(body, denoiser.manifest), denoiser, parity_inputs(verify_cubes, 0))
+        inputs = parity_inputs(verify_cubes, 0, channels=denoiser.manifest.channels)
+        report = compare(session_denoiser(body, denoiser.manifest), denoiser, inputs)
         if not report["max_error"] <= 1e-4:
             raise ValueError(f"export_onnx: ONNX and torch differ by {report['max_error']:.2e}, more than 1e-4")
     write_sealed(out_path, body, denoiser.manifest)

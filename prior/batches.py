@@ -1,10 +1,15 @@
-"""Endless training batches from memory-mapped shards; sample i depends on (seed, i) alone."""
+"""Endless training batches from memory-mapped shards; sample i depends on (seed, i) alone.
+
+A batch holds the channels that a run asks for (:mod:`unghost.core.channels`). What a shard does not store is unknown,
+and of the rest a share is made unknown at random, cube by cube and channel by channel: so one model serves those who
+can supply a channel and those who cannot.
+"""
 
 from __future__ import annotations
 
 import itertools
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +18,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.channels import (
+    SIGNED_OPACITY,
+    SURROUNDINGS,
+    VIEW_COUNT,
+    check_channels,
+    encode_surroundings,
+    encode_view_count,
+    stack_channels,
+)
 from ..core.schedule import timestep_from_severity
 from ..core.shards import Shard, dequantize_signed, read_shard, unpack_labels
 
@@ -49,7 +63,7 @@ def scale_depth(signed: NDArray[np.float32], factor: float) -> NDArray[np.float3
 
 @dataclass(frozen=True)
 class Batch:
-    """``channels (N, 1, R, R, R)``, ``labels (N, R, R, R)``, the rest ``(N,)``; ``harvested``: of a fitted field."""
+    """``channels (N, C, R, R, R)``, ``labels (N, R, R, R)``, the rest ``(N,)``; ``harvested``: of a fitted field."""
 
     channels: NDArray[np.float32]
     labels: NDArray[np.uint8]
@@ -58,57 +72,116 @@ class Batch:
     harvested: NDArray[np.bool_]
 
 
+@dataclass(frozen=True)
+class _Draw:
+    """What sample i is: see :class:`Mixture`. ``dropped`` names channels to be made unknown."""
+
+    shard: Shard
+    cube: int
+    symmetry: int
+    position: float
+    depth: float
+    dropped: frozenset[str]
+
+
+def stored_channels(
+    shard: Shard, index: Any, names: Sequence[str], *, depth: float = 1.0, without: Collection[str] = ()
+) -> NDArray[np.float32]:
+    """The channels of some cubes of a shard.
+
+    Args:
+        shard: what it does not store is unknown.
+        index: ``(N,)``.
+        names: of the channels, in order.
+        depth: factor on the optical depth.
+        without: names of optional channels to call unknown.
+
+    Returns:
+        ``(N, C, R, R, R)`` float32 in [-1, 1].
+    """
+
+    def opacity(stored: NDArray[np.uint8]) -> NDArray[np.float32]:
+        signed = dequantize_signed(stored[index])
+        return signed if depth == 1.0 else scale_depth(signed, depth)
+
+    wanted, known = set(names) - set(without), {}
+    if SURROUNDINGS in wanted and shard.surroundings is not None:
+        known[SURROUNDINGS] = encode_surroundings(opacity(shard.surroundings))
+    if VIEW_COUNT in wanted and shard.view_count is not None:
+        known[VIEW_COUNT] = encode_view_count(shard.view_count[index])
+    return stack_channels(names, opacity(shard.inputs), known)
+
+
+def timesteps(severity: NDArray[Any], position: NDArray[np.float64]) -> NDArray[np.int64]:
+    """``round(999 u)`` with ``u`` at ``position`` in [0, 1] between min(severity, ``BLIND_SEVERITY``) and 1."""
+    least = np.minimum(np.asarray(severity, dtype=np.float64), BLIND_SEVERITY)
+    return timestep_from_severity(least + (1.0 - least) * position)
+
+
 class Mixture:
     """Random access to an endless weighted mixture of shards.
 
-    Sample i draws, from a generator seeded by (seed, i): its shard (by weight), its cube, one of the 48 symmetries (of
-    harvested cubes also a factor on the optical depth), and ``t = round(999 u)``, ``u`` uniform in
-    [min(severity, BLIND_SEVERITY), 1]: the timestep says "at most this much corruption", from ``BLIND_SEVERITY`` on
-    "any amount"; a clean cube is seen at every timestep.
+    Sample i draws, from a generator seeded by (seed, i): its shard (by weight), its cube, one of the 48 symmetries, of
+    harvested cubes also a factor on the optical depth (the surroundings' too), ``t = round(999 u)``, ``u`` uniform in
+    [min(severity, BLIND_SEVERITY), 1], and which optional channels are dropped: the timestep says "at most this much
+    corruption", from ``BLIND_SEVERITY`` on "any amount"; a clean cube is seen at every timestep.
+
+    Args:
+        shards: folders and their weights.
+        seed: see above.
+        channels: of the batches.
+        drop_channels: probability that an optional channel of a cube is made unknown, in [0, 1].
     """
 
-    def __init__(self, shards: Sequence[tuple[str | Path, float]], *, seed: int) -> None:
+    def __init__(
+        self,
+        shards: Sequence[tuple[str | Path, float]],
+        *,
+        seed: int,
+        channels: Sequence[str] = (SIGNED_OPACITY,),
+        drop_channels: float = 0.0,
+    ) -> None:
         if not shards:
             raise ValueError("Mixture: at least one training shard is needed")
         weights = np.array([weight for _, weight in shards], dtype=np.float64)
         if not (np.isfinite(weights).all() and (weights > 0).all()):
             raise ValueError(f"Mixture: weights must be finite and > 0, got {weights.tolist()}")
+        if not 0.0 <= drop_channels <= 1.0:
+            raise ValueError(f"Mixture: drop_channels must lie in [0, 1], got {drop_channels}")
+        self.channels = check_channels(channels, caller="Mixture")
         self.shards: list[Shard] = [read_shard(path) for path, _ in shards]
         for (path, _), shard in zip(shards, self.shards):
             if not len(shard):
                 raise ValueError(f"Mixture: {path} holds no cubes")
-        self.seed = seed
+        self.seed, self.drop_channels = seed, drop_channels
         self._cumulative = np.cumsum(weights) / weights.sum()
 
-    def _draw(self, index: int) -> tuple[Shard, int, int, float, float]:
+    def _draw(self, index: int) -> _Draw:
         rng = np.random.default_rng([self.seed, index])
         choice = int(np.searchsorted(self._cumulative, rng.random(), side="right"))
         shard = self.shards[min(choice, len(self.shards) - 1)]
         cube, symmetry, position = int(rng.integers(len(shard))), int(rng.integers(len(SYMMETRIES))), rng.random()
         depth = float(np.exp(rng.uniform(-DEPTH_JITTER, DEPTH_JITTER)))
-        return shard, cube, symmetry, float(position), depth if _harvested(shard) else 1.0
+        chance = dict(zip((SURROUNDINGS, VIEW_COUNT), rng.random(2)))  # by name: the order of channels is the caller's
+        dropped = frozenset(name for name, value in chance.items() if value < self.drop_channels)
+        return _Draw(shard, cube, symmetry, float(position), depth if _harvested(shard) else 1.0, dropped)
+
+    def _channels(self, draw: _Draw) -> NDArray[np.float32]:
+        """``(C, R, R, R)`` of one sample, its symmetry applied to all alike."""
+        stored = stored_channels(draw.shard, [draw.cube], self.channels, depth=draw.depth, without=draw.dropped)[0]
+        return np.stack([apply_symmetry(grid, draw.symmetry) for grid in stored])
 
     def batch(self, step: int, batch_size: int) -> Batch:
         """Samples ``step * batch_size`` to ``(step + 1) * batch_size``."""
         draws = [self._draw(index) for index in range(step * batch_size, (step + 1) * batch_size)]
-        stored = [apply_symmetry(shard.inputs[cube], symmetry) for shard, cube, symmetry, *_ in draws]
-        signed = dequantize_signed(np.stack(stored))
-        for row, (*_, depth) in enumerate(draws):
-            if depth != 1.0:
-                signed[row] = scale_depth(signed[row], depth)
-        labels = [
-            apply_symmetry(unpack_labels(shard.labels[cube : cube + 1])[0], symmetry)
-            for shard, cube, symmetry, *_ in draws
-        ]
-        severity = np.array([shard.severity[cube] for shard, cube, *_ in draws], dtype=np.float64)
-        least = np.minimum(severity, BLIND_SEVERITY)
-        position = np.array([position for *_, position, _ in draws])
+        labels = [apply_symmetry(unpack_labels(d.shard.labels[d.cube : d.cube + 1])[0], d.symmetry) for d in draws]
+        severity = np.array([d.shard.severity[d.cube] for d in draws])
         return Batch(
-            signed[:, None],
+            np.stack([self._channels(d) for d in draws]),
             np.stack(labels),
-            timestep_from_severity(least + (1.0 - least) * position),
-            np.array([shard.edge_fraction[cube] for shard, cube, *_ in draws], dtype=np.float32),
-            np.array([_harvested(shard) for shard, *_ in draws]),
+            timesteps(severity, np.array([d.position for d in draws])),
+            np.array([d.shard.edge_fraction[d.cube] for d in draws], dtype=np.float32),
+            np.array([_harvested(d.shard) for d in draws]),
         )
 
     def stream(self, first_step: int, batch_size: int, *, ahead: int = 2) -> Iterator[Batch]:

@@ -70,9 +70,9 @@ class TorchDenoiser:
     kind = "torch"
 
     def __init__(self, network: RestorationNet, manifest: Manifest) -> None:
-        if len(manifest.channels) != network.config.channels:
+        if manifest.channels != network.config.channels:
             raise ValueError(
-                f"TorchDenoiser: the manifest names {len(manifest.channels)} channels, "
+                f"TorchDenoiser: the manifest names the channels {manifest.channels}, "
                 f"the network takes {network.config.channels}"
             )
         self.network = network.eval().requires_grad_(False)
@@ -121,9 +121,9 @@ class TorchDenoiser:
 
 def save_model(path: str | Path, network: RestorationNet, manifest: Manifest) -> None:
     """Write weights, manifest and network configuration as one safetensors file, atomically."""
-    if len(manifest.channels) != network.config.channels:
+    if manifest.channels != network.config.channels:
         raise ValueError(
-            f"save_model: the manifest names {len(manifest.channels)} channels, "
+            f"save_model: the manifest names the channels {manifest.channels}, "
             f"the network takes {network.config.channels}"
         )
     metadata = {METADATA_KEY: manifest.to_json(), CONFIG_KEY: json.dumps(network.config.to_dict(), sort_keys=True)}
@@ -160,6 +160,6 @@ def load_model(path: str | Path, *, device: torch.device | str = "cpu") -> Torch
         raise ValueError(f"load_model: {path} is not an unghost checkpoint (its header has no {METADATA_KEY!r})")
     manifest = Manifest.from_json(metadata[METADATA_KEY], origin=str(path))
     network = network_from_tensors(tensors, metadata, origin=str(path))
-    if len(manifest.channels) != network.config.channels:
-        raise ValueError(f"{path}: its manifest and its network disagree on the number of channels")
+    if manifest.channels != network.config.channels:
+        raise ValueError(f"{path}: its manifest and its network disagree on the channels")
     return TorchDenoiser(network.to(device), manifest)

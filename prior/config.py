@@ -18,7 +18,7 @@ class TrainConfig:
 
     Attributes:
         name: of the model, for its manifest.
-        network: widths and depths.
+        network: channels, widths and depths.
         seed: of the initial weights and of the stream of samples.
         steps: optimiser steps; with ``max_seconds`` whichever is over first.
         max_seconds: time budget, or None. The learning rate follows ``max(step / steps, elapsed / max_seconds)``,
@@ -30,6 +30,8 @@ class TrainConfig:
         warmup_steps: of linear warm-up.
         gradient_clip: largest norm of the gradient.
         ema_decay: of the averaged weights, which are the ones kept.
+        drop_channels: share of the cubes of which an optional channel is made unknown, channel by channel: the model
+            then serves callers who cannot supply it.
         interesting_weight: of voxels that are opaque, surface or beside such, in the loss.
         keep_weight: of true surface in harvested cubes, on top. In fog the odds of a voxel being surface are seldom
             even; with 8, the decision ``x0_pred < 0`` removes only what is ghost at more than 8 : 1.
@@ -58,6 +60,7 @@ class TrainConfig:
     warmup_steps: int = 200
     gradient_clip: float = 1.0
     ema_decay: float = 0.999
+    drop_channels: float = 0.15
     interesting_weight: float = 4.0
     keep_weight: float = 8.0
     precision: Literal["auto", "bf16", "fp32"] = "auto"
@@ -84,12 +87,12 @@ class TrainConfig:
                 raise ValueError(f"TrainConfig: {name} must be finite and >= 0, got {value}")
         if self.max_seconds is not None and not self.max_seconds > 0:
             raise ValueError(f"TrainConfig: max_seconds must be > 0 or None, got {self.max_seconds}")
+        if not 0.0 <= self.drop_channels <= 1.0:
+            raise ValueError(f"TrainConfig: drop_channels must lie in [0, 1], got {self.drop_channels}")
         if not 0.0 <= self.ema_decay < 1.0:
             raise ValueError(f"TrainConfig: ema_decay must lie in [0, 1), got {self.ema_decay}")
         if self.precision not in ("auto", "bf16", "fp32"):
             raise ValueError(f"TrainConfig: precision must be 'auto', 'bf16' or 'fp32', got {self.precision!r}")
-        if self.network.channels != 1:
-            raise ValueError(f"TrainConfig: shards hold one channel, network.channels is {self.network.channels}")
 
     def to_json(self) -> str:
         """One JSON object."""

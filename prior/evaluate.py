@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -20,7 +21,8 @@ from ..core.occupancy import (
     SURFACE_LABEL,
     opacity_from_signed,
 )
-from ..core.shards import Shard, dequantize_signed, unpack_labels
+from ..core.shards import Shard, unpack_labels
+from .batches import stored_channels
 
 HISTOGRAM_BINS = 2048  # over [-1, 1]: thresholds are exact to 1/1024
 KEPT = (0.98, 0.95, 0.90)
@@ -82,8 +84,9 @@ def _denoise(denoiser: Denoiser, channels: NDArray[np.float32], timestep: int, e
 
 
 def evaluate(
-    denoiser: Denoiser, shard: Shard, *, timestep: int | None = None, limit: int | None = None, batch_size: int = 64
-) -> dict[str, Any]:
+    denoiser: Denoiser, shard: Shard, *, timestep: int | None = None, limit: int | None = None, batch_size: int = 64,
+    without: Collection[str] = (),
+) -> dict[str, Any]:  # fmt: skip
     """IoU before and after, and how many ghosts go when nearly all of the true surface stays.
 
     Occupied is opacity > 0.1 in the input, ``x0_pred`` > 0 in the output, "surface" in the label; ignored
@@ -91,11 +94,12 @@ def evaluate(
     surface. One score above a threshold keeps a voxel: ``x0_pred``, and beside it the raw opacity.
 
     Args:
-        denoiser: of one channel, torch or numpy.
+        denoiser: torch or numpy, of any channels; those that the shard does not store are unknown.
         shard: held-out pairs.
         timestep: the same for all; None for the manifest's default.
         limit: at most so many cubes, evenly spread.
         batch_size: cubes at a time.
+        without: names of optional channels to call unknown, as for a caller who cannot supply them.
 
     Returns:
         ``cubes, timestep, iou_before, iou, iou_clean`` (severity 0; None without such cubes), ``by_severity``
@@ -109,9 +113,9 @@ def evaluate(
     learned, raw = KeepCurve(), KeepCurve()
     for start in range(0, len(chosen), batch_size):
         index = chosen[start : start + batch_size]
-        signed = dequantize_signed(shard.inputs[index])
-        labels = unpack_labels(shard.labels[index])
-        x0_pred = _denoise(denoiser, signed[:, None], step, np.array(shard.edge_fraction[index]))
+        channels = stored_channels(shard, index, denoiser.manifest.channels, without=without)
+        signed, labels = channels[:, 0], unpack_labels(shard.labels[index])
+        x0_pred = _denoise(denoiser, channels, step, np.array(shard.edge_fraction[index]))
         opaque = opacity_from_signed(signed) > DEFAULT_OPACITY_THRESHOLD
         surface, valid = labels == SURFACE_LABEL, labels != IGNORE_LABEL
         before[start : start + len(index)] = masked_iou(opaque, surface, valid)

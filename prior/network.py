@@ -4,6 +4,9 @@ No normalisation layers, all work on grids of 16^3 and coarser, where 3D convolu
 
     channels 32^3 -> features -> space-to-depth -> stem 16^3 -> 8^3 -> 4^3 -> 8^3 -> 16^3 -> depth-to-space
                 \\______________________________ gain * first channel _____________________________/
+
+The surroundings, where a network has them, do not line up with the cube and enter by a branch of their own
+(``prior/context.py``) at 8^3.
 """
 
 from __future__ import annotations
@@ -18,15 +21,17 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from ..core.channels import SIGNED_OPACITY, SURROUNDINGS, check_channels
 from ..core.frames import RESOLUTION
 from ..core.occupancy import opacity_from_signed
 from ..core.schedule import TIMESTEPS
+from .context import LEAK as LEAK
+from .context import ContextBranch, activate, context_work
 
 FREQUENCIES = 4
 CONDITION_FEATURES = 2 * (2 * FREQUENCIES + 1)
 EDGE_FRACTION_CENTER, EDGE_FRACTION_SPREAD = 0.1, 3.0  # log(edge_fraction) is squashed around the first
 INITIAL_GAIN = 4.0
-LEAK = 0.1  # slope of the rectifiers below zero
 
 
 @dataclass(frozen=True)
@@ -34,22 +39,21 @@ class NetworkConfig:
     """Widths and depths; sizes XS to L differ in nothing else.
 
     Attributes:
-        channels: input channels; the first is signed opacity.
+        channels: names of the input channels (:mod:`unghost.core.channels`); the first is signed opacity.
         widths: feature channels at 16^3, 8^3 and 4^3; multiples of 8.
         blocks: residual blocks at 8^3 going down, at 4^3, and at 8^3 going up.
         condition_width: hidden units of the conditioning network.
     """
 
-    channels: int = 1
+    channels: tuple[str, ...] = (SIGNED_OPACITY,)
     widths: tuple[int, int, int] = (32, 64, 80)
     blocks: tuple[int, int, int] = (1, 1, 1)
     condition_width: int = 64
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "channels", check_channels(self.channels, caller="NetworkConfig"))
         object.__setattr__(self, "widths", tuple(self.widths))
         object.__setattr__(self, "blocks", tuple(self.blocks))
-        if self.channels < 1:
-            raise ValueError(f"NetworkConfig: channels must be >= 1, got {self.channels}")
         if len(self.widths) != 3 or any(width < 8 or width % 8 for width in self.widths):
             raise ValueError(f"NetworkConfig: widths must be three multiples of 8, got {self.widths}")
         if len(self.blocks) != 3 or any(count < 0 for count in self.blocks) or not sum(self.blocks):
@@ -57,17 +61,30 @@ class NetworkConfig:
         if self.condition_width < 1:
             raise ValueError(f"NetworkConfig: condition_width must be >= 1, got {self.condition_width}")
 
+    @property
+    def aligned(self) -> tuple[int, ...]:
+        """Positions of the channels whose voxels are the cube's own: all but the surroundings."""
+        return tuple(index for index, name in enumerate(self.channels) if name != SURROUNDINGS)
+
+    @property
+    def surroundings(self) -> int | None:
+        """Position of the surroundings, or None."""
+        return self.channels.index(SURROUNDINGS) if SURROUNDINGS in self.channels else None
+
     def to_dict(self) -> dict[str, Any]:
         """JSON-able."""
         return dataclasses.asdict(self)
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> NetworkConfig:
-        """Inverse of :meth:`to_dict`; unknown keys are refused."""
+        """Inverse of :meth:`to_dict`; unknown keys are refused. ``channels`` may be 1, as it used to be written."""
         known = {item.name for item in dataclasses.fields(cls)}
         if set(values) - known:
             raise ValueError(f"NetworkConfig: unknown keys {sorted(set(values) - known)}, known: {sorted(known)}")
-        return cls(**values)
+        body = dict(values)
+        if body.get("channels") == 1:
+            body["channels"] = (SIGNED_OPACITY,)
+        return cls(**body)
 
 
 SIZES: dict[str, NetworkConfig] = {
@@ -115,11 +132,6 @@ def condition_features(timestep: Tensor, edge_fraction: Tensor) -> Tensor:
     return torch.cat([base, torch.sin(angles), torch.cos(angles)], dim=1)
 
 
-def activate(grid: Tensor) -> Tensor:
-    """Leaky rectifier. There are no norm layers: plain rectifiers were seen to die for good within 900 steps."""
-    return functional.leaky_relu(grid, LEAK)
-
-
 class ResidualBlock(nn.Module):
     """``x + conv2(leaky_relu(conv1(x) + bias))``, the bias coming from the conditioning; conv2 starts small."""
 
@@ -165,7 +177,7 @@ class RestorationNet(nn.Module):
         super().__init__()
         self.config = config
         fine, middle, coarse = config.widths
-        self.stem = nn.Conv3d(8 * config.channels, fine, 3, padding=1)
+        self.stem = nn.Conv3d(8 * len(config.aligned), fine, 3, padding=1)
         self.down_middle = nn.Conv3d(fine, middle, 2, stride=2)
         self.down_coarse = nn.Conv3d(middle, coarse, 2, stride=2)
         self.up_middle = Upsample(coarse, middle)
@@ -175,7 +187,7 @@ class RestorationNet(nn.Module):
         widths = [middle] * config.blocks[0] + [coarse] * config.blocks[1] + [middle] * config.blocks[2]
         self.blocks = nn.ModuleList(ResidualBlock(width) for width in widths)
         self.condition = nn.Sequential(
-            nn.Linear(CONDITION_FEATURES, config.condition_width),
+            nn.Linear(CONDITION_FEATURES + (0 if config.surroundings is None else fine), config.condition_width),
             nn.ReLU(),
             nn.Linear(config.condition_width, config.condition_width),
             nn.ReLU(),
@@ -183,6 +195,8 @@ class RestorationNet(nn.Module):
         )
         with torch.no_grad():
             self.head.weight.mul_(0.1)
+        if config.surroundings is not None:
+            self.context = ContextBranch(fine, middle)
 
     def logits(self, channels: Tensor, timestep: Tensor, edge_fraction: Tensor) -> Tensor:
         """Log-odds of "surface" for each voxel.
@@ -195,13 +209,21 @@ class RestorationNet(nn.Module):
         Returns:
             ``(N, 1, 32, 32, 32)``, unbounded.
         """
-        _check_shapes(channels, timestep, edge_fraction, self.config.channels)
-        down, bottom, _ = self.config.blocks
+        config = self.config
+        _check_shapes(channels, timestep, edge_fraction, len(config.channels))
+        down, bottom, _ = config.blocks
+        condition, aligned, beside = condition_features(timestep, edge_fraction), channels, None
+        if config.surroundings is not None:
+            aligned = channels[:, list(config.aligned)]
+            beside, pooled = self.context(channels[:, config.surroundings : config.surroundings + 1])
+            condition = torch.cat([condition, pooled.to(condition.dtype)], dim=1)
         widths = [block.first.in_channels for block in self.blocks]  # type: ignore[union-attr]
-        biases = self.condition(condition_features(timestep, edge_fraction)).split(widths, dim=1)
+        biases = self.condition(condition).split(widths, dim=1)
         steps = list(zip(self.blocks, biases))
-        fine = activate(self.stem(space_to_depth(voxel_features(channels))))
+        fine = activate(self.stem(space_to_depth(voxel_features(aligned))))
         middle = self.down_middle(fine)
+        if beside is not None:
+            middle = middle + beside
         for block, bias in steps[:down]:
             middle = block(middle, bias)
         coarse = self.down_coarse(middle)
@@ -240,7 +262,9 @@ def gflop(config: NetworkConfig) -> float:
     """Convolution work for one cube in 10^9 operations (a multiply-add is two)."""
     fine, middle, coarse = config.widths
     down, bottom, up = config.blocks
-    work = 16**3 * 27 * fine * (8 * config.channels + 8)  # stem and head
+    work = 16**3 * 27 * fine * (8 * len(config.aligned) + 8)  # stem and head
     work += 8**3 * (8 * fine * middle + 27 * 2 * middle**2 * (down + up) + 8 * middle * fine)
     work += 4**3 * (8 * middle * coarse + 27 * 2 * coarse**2 * bottom + 8 * coarse * middle)
+    if config.surroundings is not None:
+        work += context_work(fine, middle)
     return 2.0 * work / 1e9

@@ -16,6 +16,7 @@ from ..core.manifest import Manifest
 from ..core.results import commit, versions
 from ..core.shards import Shard, read_shard
 from .batches import Mixture
+from .blend import Blend, Online
 from .checkpoint import TorchDenoiser, save_model
 from .config import TrainConfig
 from .evaluate import evaluate
@@ -72,8 +73,9 @@ def _write_text(path: Path, text: str) -> None:
     os.replace(partial, path)
 
 
-def _provenance(trainer: Trainer, shards: Sequence[tuple[str | Path, float]], mixture: Mixture) -> dict[str, Any]:
+def _provenance(trainer: Trainer, shards: Sequence[tuple[str | Path, float]], blend: Blend) -> dict[str, Any]:
     config = trainer.config
+    opened = [] if blend.mixture is None else blend.mixture.shards
     return {
         "seed": config.seed, "steps": trainer.step, "seconds": round(trainer.elapsed, 1),
         "batch_size": config.batch_size, "precision": "bf16" if trainer.bf16 else "fp32", "commit": commit(),
@@ -82,14 +84,17 @@ def _provenance(trainer: Trainer, shards: Sequence[tuple[str | Path, float]], mi
         "threshold_from": config.threshold_from, "started_from": trainer.started_from,
         "shards": [
             {"source": Path(path).parent.name, "name": Path(path).name, "weight": weight, "cubes": len(shard)}
-            for (path, weight), shard in zip(shards, mixture.shards)
+            for (path, weight), shard in zip(shards, opened)
         ],
+        "drop_channels": config.drop_channels,
+        "online": [{"name": part.name, "share": part.share} for part in blend.online],
     }  # fmt: skip
 
 
 def _manifest(trainer: Trainer, training: dict[str, Any], threshold: float = 0.0) -> Manifest:
     return Manifest(
-        name=trainer.config.name, default_timestep=trainer.config.default_timestep, removal_threshold=threshold,
+        name=trainer.config.name, channels=trainer.config.network.channels,
+        default_timestep=trainer.config.default_timestep, removal_threshold=threshold,
         parameters=parameter_count(trainer.network), training=training,
     )  # fmt: skip
 
@@ -143,7 +148,7 @@ def _prepare(config: TrainConfig, out: Path, resume: bool) -> Trainer:
 
 
 def _run(
-    trainer: Trainer, mixture: Mixture, out: Path, log: _Log, validation: Mapping[str, Shard],
+    trainer: Trainer, blend: Blend, out: Path, log: _Log, validation: Mapping[str, Shard],
     progress: bool, on_step: Callable[[int, Mapping[str, float]], None] | None,
 ) -> str:  # fmt: skip
     """Step until the budget is used; why it ended."""
@@ -153,7 +158,7 @@ def _run(
     bar = tqdm(total=1.0, initial=trainer.progress, disable=not progress, dynamic_ncols=True, bar_format=BAR_FORMAT)
     begun, carried = time.monotonic(), trainer.elapsed
     first, saved, validated, shown = trainer.step, begun, begun, 0.0
-    batches = mixture.stream(trainer.step, config.batch_size)
+    batches = blend.stream(trainer.step)
     try:
         while trainer.progress < 1.0:
             values = trainer.learn(next(batches))
@@ -181,11 +186,21 @@ def _run(
     return "steps" if trainer.step >= config.steps else "max_seconds"
 
 
+def _blend(config: TrainConfig, shards: Sequence[tuple[str | Path, float]], online: Sequence[Online]) -> Blend:
+    """The stream of batches of a run."""
+    names = config.network.channels
+    mixture = None
+    if shards or not online:
+        mixture = Mixture(shards, seed=config.seed, channels=names, drop_channels=config.drop_channels)
+    return Blend(mixture, online, batch_size=config.batch_size, channels=names, seed=config.seed)
+
+
 def train(
     config: TrainConfig,
     *,
     train_shards: Sequence[tuple[str | Path, float]],
     validation_shards: Mapping[str, str | Path] | None = None,
+    online: Sequence[Online] = (),
     out: str | Path,
     resume: bool = False,
     progress: bool = True,
@@ -199,8 +214,11 @@ def train(
 
     Args:
         config: the run.
-        train_shards: folders of :func:`unghost.core.shards.write_shard` and their weights in the mixture.
+        train_shards: folders of :func:`unghost.core.shards.write_shard` and their weights in the mixture; may be empty
+            where online sources fill the batches.
         validation_shards: name to folder; held out.
+        online: sources of pairs that are made meanwhile, each with its share of every batch. A run that is resumed with
+            the same sources goes on with the samples that would have come.
         out: folder; must not hold a run unless ``resume``.
         resume: go on from ``out/state.safetensors`` (from the start if there is none).
         progress: a bar with loss, cubes per second and the part of the budget used.
@@ -214,7 +232,7 @@ def train(
     named = dict(validation_shards or {})
     if not set(_threshold_names(config)) <= set(named):
         raise ValueError(f"train: threshold_from {config.threshold_from!r} is not among {sorted(named)}")
-    mixture = Mixture(train_shards, seed=config.seed)
+    blend = _blend(config, train_shards, online)
     validation = {name: read_shard(path) for name, path in named.items()}
     if config.threads:
         torch.set_num_threads(config.threads)
@@ -222,9 +240,9 @@ def train(
     trainer = _prepare(config, folder, resume)
     log = _Log(folder)
     try:
-        reason = _run(trainer, mixture, folder, log, validation, progress, on_step)
+        reason = _run(trainer, blend, folder, log, validation, progress, on_step)
         trainer.save(folder / STATE_FILE)
-        scores = _finish(trainer, folder, _provenance(trainer, train_shards, mixture), validation)
+        scores = _finish(trainer, folder, _provenance(trainer, train_shards, blend), validation)
         _log_validation(log, trainer.step, scores)
     finally:
         log.close()

@@ -97,7 +97,7 @@ class Trainer:
             logits = self.network.logits(channels, times, edges)
         kept = torch.from_numpy(np.where(batch.harvested, self.config.keep_weight, 1.0)).to(channels)
         loss = restoration_loss(
-            logits, labels, channels, interesting_weight=self.config.interesting_weight, keep_weight=kept
+            logits, labels, channels[:, :1], interesting_weight=self.config.interesting_weight, keep_weight=kept
         ).mean()
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]

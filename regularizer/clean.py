@@ -12,9 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..core.aabb import as_aabb, scene_extent
+from ..core.cameras import Cameras
 from ..core.manifest import Denoiser
 from ..core.occupancy import EMPTY, OccupancyRule, check_density
 from ..core.schedule import check_timestep
+from .context import GridContext
 from .decide import decide, removed_regions
 from .denoise import check_denoiser
 from .keep_mask import KeepMask, lattice_origin
@@ -114,6 +116,7 @@ def clean(
     aabb: ArrayLike,
     *,
     denoiser: Denoiser,
+    cameras: Cameras | None = None,
     settings: CleanSettings | None = None,
     progress: Progress | None = None,
     **overrides: Any,
@@ -130,7 +133,8 @@ def clean(
             Unless ``backend`` says which, a torch module (or a method of one) gets tensors; any other callable is
             asked about one point with an array and, if that raises and torch is loaded, with a tensor.
         aabb: ``(2, 3)`` scene units: where to clean; the rest is left as it is.
-        denoiser: of one channel, kind ``"numpy"`` or ``"torch"``.
+        denoiser: kind ``"numpy"`` or ``"torch"``. One that asks for the surroundings gets them from the same grid.
+        cameras: of the training photos, for a denoiser that asks for view counts; without them those are unknown.
         settings: see :class:`CleanSettings`; ``overrides`` replace single ones (``field_pitch`` foremost).
         progress: called with (windows done, windows in all), level by level.
 
@@ -154,7 +158,7 @@ def clean(
     pitch, shape = grid_of(box, s)
     query = make_query(density_fn, place=box.mean(axis=0), backend=s.backend, chunk=s.chunk, caller="clean")
     survey = _survey(query, box, pitch, shape, s)
-    score, windows = _score(survey, denoiser, s, pitch / scene_extent(box), progress)
+    score, windows = _score(survey, denoiser, s, box, pitch, cameras, progress)
     threshold = threshold_of(s.strength, denoiser.manifest.removal_threshold)
     removed, faint = decide(
         survey.occupied, survey.judged, score,
@@ -228,9 +232,11 @@ def _survey(
 
 
 def _score(
-    survey: _Survey, denoiser: Denoiser, s: CleanSettings, pitch_fraction: float, progress: Progress | None
-) -> tuple[FloatGrid, int]:
+    survey: _Survey, denoiser: Denoiser, s: CleanSettings, aabb: NDArray[np.float64], pitch: float,
+    cameras: Cameras | None, progress: Progress | None,
+) -> tuple[FloatGrid, int]:  # fmt: skip
     """Weighted mean of the levels' votes, and the windows it took."""
+    origin, names = lattice_origin(aabb, pitch, survey.signed.shape), denoiser.manifest.channels
     timestep = denoiser.manifest.default_timestep if s.timestep is None else s.timestep
     total = np.zeros(survey.signed.shape, dtype=np.float32)
     windows = 0
@@ -239,15 +245,17 @@ def _score(
             continue
         factor = 2**level
         judged = shrink(survey.judged.astype(np.float32), factor) > 0
+        signed = shrink(survey.signed, factor)
         votes, sent = vote(
-            shrink(survey.signed, factor),
+            signed,
             judged,
             denoiser=denoiser,
             timestep=timestep,
-            edge_fraction=denoiser.manifest.resolution * factor * pitch_fraction,
+            edge_fraction=denoiser.manifest.resolution * factor * pitch / scene_extent(aabb),
             overlap=s.overlap,
             skip_empty=s.skip_empty,
             progress=progress,
+            context=GridContext(names, signed, origin=origin, pitch=factor * pitch, cameras=cameras),
         )
         total += np.float32(weight / sum(s.level_weights)) * grow(votes, factor, total.shape)
         windows += sent

@@ -35,12 +35,15 @@ class CubeBatch:
         inside: ``(N, R, R, R)`` bool: in the scene's box.
         pitch: ``(N, 1, 1, 1)`` what an opacity is measured over: the field's cell, or the cube's voxel.
         edge_fraction: ``(N,)``.
+        centers, edges: ``(N, 3)`` and ``(N,)`` float64, scene units.
     """
 
     positions: Tensor
     inside: Tensor
     pitch: Tensor
     edge_fraction: NDArray[np.float64]
+    centers: NDArray[np.float64]
+    edges: NDArray[np.float64]
 
     def thinned(self, values: Tensor, used: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Positions ``(M, 3)``, ``values`` and pitches ``(M,)`` of every fourth voxel that is ``used``."""
@@ -85,4 +88,4 @@ def draw_cubes(
     inside = ((positions >= corners[0]) & (positions <= corners[1])).all(dim=-1)
     cell = edges / resolution if pitch is None else np.array(pitch)
     cell_tensor = torch.as_tensor(cell, dtype=wide_dtype(device), device=device)[:, None, None, None]
-    return CubeBatch(positions, inside, cell_tensor, edges / scene_extent(box))
+    return CubeBatch(positions, inside, cell_tensor, edges / scene_extent(box), centers, edges)

@@ -9,22 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.arrays import is_tensor, to_numpy
-from ..core.manifest import CHANNEL_NAMES, Denoiser
+from ..core.manifest import Denoiser
 
 BATCH = 40  # cubes handed to a denoiser at once
 
 
 def check_denoiser(denoiser: Denoiser, *, caller: str) -> Denoiser:
-    """Refuse what is no denoiser, or one that wants channels no density callable can give."""
+    """Refuse what is no denoiser."""
     if not callable(denoiser) or not hasattr(denoiser, "manifest"):
         raise TypeError(f"{caller}: denoiser must be callable and have a manifest, got {type(denoiser).__name__}")
     if getattr(denoiser, "kind", None) not in ("numpy", "torch"):
         raise ValueError(f"{caller}: denoiser.kind must be 'numpy' or 'torch', got {getattr(denoiser, 'kind', None)!r}")
-    if denoiser.manifest.channels != CHANNEL_NAMES[:1]:
-        raise ValueError(
-            f"{caller}: denoiser must take the channel {CHANNEL_NAMES[0]!r} alone, "
-            f"{denoiser.manifest.name!r} takes {denoiser.manifest.channels}"
-        )
     return denoiser
 
 
@@ -35,7 +30,7 @@ def run_denoiser(
 
     Args:
         denoiser: see :class:`Denoiser`.
-        channels: ``(N, 1, R, R, R)`` float32 in [-1, 1], array or tensor.
+        channels: ``(N, C, R, R, R)`` float32 in [-1, 1], array or tensor.
         timestep: in [0, 1000).
         edge_fraction: ``(N,)``.
         caller: for errors.
@@ -47,15 +42,16 @@ def run_denoiser(
         ValueError: a prediction of another shape, or one that is not finite.
     """
     if len(channels) == 0:
-        return channels
+        return channels[:, :1]
     fractions = np.asarray(edge_fraction, dtype=np.float32)
     pieces = []
     for start in range(0, len(channels), BATCH):
         part, fraction = channels[start : start + BATCH], fractions[start : start + BATCH]
         pieces.append(_run_one(denoiser, part, timestep, fraction))
-        if tuple(pieces[-1].shape) != tuple(part.shape):
+        expected = (len(part), 1, *part.shape[2:])
+        if tuple(pieces[-1].shape) != expected:
             raise ValueError(
-                f"{caller}: denoiser {denoiser.manifest.name!r} must return shape {tuple(part.shape)}, "
+                f"{caller}: denoiser {denoiser.manifest.name!r} must return shape {expected}, "
                 f"got {tuple(pieces[-1].shape)}"
             )
     if is_tensor(channels):

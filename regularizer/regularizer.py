@@ -22,6 +22,8 @@ from ..core.cameras import Cameras
 from ..core.manifest import Denoiser
 from ..core.occupancy import DECISION, EMPTY, check_density, check_density_shape, opacity_from_density
 from ..core.schedule import check_timestep
+from .context import viewing_cameras
+from .cube_context import complete_channels, cube_surroundings
 from .cubes import CubeBatch, FieldPitch, draw_cubes, wide_dtype
 from .denoise import check_denoiser, run_denoiser
 from .losses import dsds_loss, stable_mean, upcast, visibility_loss, widest
@@ -52,9 +54,9 @@ class DensityRegularizer:
     Losses are means over the voxels (points) in the box, times their weight; those of several fields are added.
 
     Args:
-        denoiser: of one channel, kind ``"numpy"`` or ``"torch"``.
+        denoiser: kind ``"numpy"`` or ``"torch"``. One that asks for the surroundings costs as many positions again.
         aabb: ``(2, 3)``, scene units: where to clean.
-        cameras: of the training photos; None for no visibility loss.
+        cameras: of the training photos; None for no visibility loss, and view counts unknown to a denoiser that asks.
         field_pitch: side of the field's own cells in scene units, or a function of cube centres ``(N, 3)``
             that gives it as ``(N,)`` (a contracted field); None if unknown: then the cube's voxel.
         device: where positions are created; None for the device of the field's parameters, else the CPU.
@@ -102,6 +104,7 @@ class DensityRegularizer:
             )
         self.grid = ImportanceGrid(self.aabb, resolution=s.grid_resolution, decay=s.grid_decay)
         self._views = ViewCounter(cameras, min_views=s.min_views) if cameras is not None and len(cameras) else None
+        self._viewing = viewing_cameras(cameras, denoiser.manifest.channels)
         self.step = 0
         self.report: Counter[str] = Counter()
         self.totals: Counter[str] = Counter()
@@ -229,7 +232,7 @@ class DensityRegularizer:
         used = cubes.inside.clone().masked_scatter(cubes.inside, valid)
         if main:
             self._refresh(*cubes.thinned(density.detach(), used))
-        x0_pred = self._predict(density.detach(), cubes)
+        x0_pred = self._predict(density.detach(), cubes, field)
         depth = widest(density) * cubes.pitch if self.settings.rule.kind == "opacity" else density
         loss = dsds_loss(
             depth,
@@ -240,7 +243,7 @@ class DensityRegularizer:
         )
         return stable_mean(torch.where(used, loss, torch.zeros_like(loss)), count=int(used.sum()))
 
-    def _predict(self, density: Tensor, cubes: CubeBatch) -> Tensor:
+    def _predict(self, density: Tensor, cubes: CubeBatch, field: DensityFn) -> Tensor:
         """``x0_pred (N, R, R, R)`` float32; all empty for cubes that were not worth asking about."""
         s = self.settings
         wide = widest(density)
@@ -252,6 +255,13 @@ class DensityRegularizer:
         if not bool(asked.any()):
             return x0_pred
         channels = s.rule.encode(wide[asked], cubes.pitch[asked], soft=s.soft).float()[:, None]
+        if len(self.denoiser.manifest.channels) > 1:
+            channels = complete_channels(
+                self.denoiser.manifest.channels, channels, cubes, asked, viewing=self._viewing,
+                surroundings=lambda: cube_surroundings(
+                    lambda places: self._query(field, places)[0], cubes, asked, aabb=self.aabb, rule=s.rule, soft=s.soft
+                ),
+            )  # fmt: skip
         t = s.timestep(self.step) if callable(s.timestep) else s.timestep
         t = self.denoiser.manifest.default_timestep if t is None else t
         timestep = int(check_timestep(t, caller="DensityRegularizer"))

@@ -8,8 +8,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.channels import stack_channels
 from ..core.manifest import Denoiser
 from ..core.occupancy import EMPTY
+from .context import GridContext
 from .denoise import BATCH, run_denoiser
 
 FloatGrid = NDArray[np.float32]
@@ -57,6 +59,7 @@ def vote(
     overlap: float = 0.5,
     skip_empty: bool = True,
     progress: Progress | None = None,
+    context: GridContext | None = None,
 ) -> tuple[FloatGrid, int]:
     """Weighted mean of ``x0_pred`` over all windows that hold a cell.
 
@@ -64,12 +67,13 @@ def vote(
         signed: ``(X, Y, Z)`` signed opacity; what lies beyond counts as empty.
         wanted: ``(X, Y, Z)`` where an answer is needed; windows without such a cell are not sent (their
             answer could not matter), unless ``skip_empty`` is False.
-        denoiser: of one channel.
+        denoiser: of any channels.
         timestep: in [0, 1000).
         edge_fraction: of a window.
         overlap: of neighbouring windows along an axis, in [0, 1).
         skip_empty: see ``wanted``.
         progress: called with (windows done, windows in all).
+        context: supplies optional channels; without it they are unknown.
 
     Returns:
         ``(X, Y, Z)`` float32 in [-1, 1], ``EMPTY`` where no window was sent; and how many were sent.
@@ -90,7 +94,12 @@ def vote(
     weight = window_weight(resolution)
     for start in range(0, len(corners), BATCH):
         batch = corners[start : start + BATCH]
-        channels = np.stack([padded[_box(corner, resolution)] for corner in batch])[:, None]
+        signed_windows = np.stack([padded[_box(corner, resolution)] for corner in batch])
+        channels = signed_windows[:, None]
+        if len(denoiser.manifest.channels) > 1:
+            places = [tuple(at - before for at, (before, _) in zip(corner, pad)) for corner in batch]
+            known = {} if context is None else context.known(places)
+            channels = stack_channels(denoiser.manifest.channels, signed_windows, known)
         fractions = np.full(len(batch), edge_fraction)
         predictions = run_denoiser(denoiser, channels, timestep, fractions, caller="clean")
         for corner, prediction in zip(batch, predictions):

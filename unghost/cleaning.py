@@ -17,7 +17,8 @@ def clean(density_fn: Callable[..., Any], aabb: Any, *, denoiser: Any = None, **
         density_fn: ``positions (..., 3) -> density (..., 1) or (...)``, numpy or torch, >= 0 per scene unit.
         aabb: ``(2, 3)`` smallest and largest corner, scene units; nothing outside it is changed.
         denoiser: from :func:`unghost.load_denoiser`; None loads the shipped one through onnxruntime.
-        **options: those of :func:`unghost.regularizer.clean.clean`, ``field_pitch`` foremost.
+        **options: those of :func:`unghost.regularizer.clean.clean`, ``field_pitch`` foremost; ``cameras`` for a
+            denoiser that asks how many of them see a place.
 
     Returns:
         A :class:`KeepMask`: ``mask.apply(density_fn)`` is the cleaned field, ``mask.save("keep.npz")``

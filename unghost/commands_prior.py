@@ -9,6 +9,8 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
+ONLINE_SEED = 1 << 32  # plus the run's seed: what is made online is in no shard
+
 
 def curate(
     recipe: Positional[str], out: Path, count: Annotated[int, arg(aliases=["-n", "--n"])] = 20_000, seed: int = 0,
@@ -143,6 +145,26 @@ def _named_shards(specs: list[str]) -> dict[str, Path]:
     return table
 
 
+def _online(specs: list[str], *, seed: int, workers: int, mesh_root: Path | None) -> list[Any]:
+    """``RECIPE=SHARE`` to sources of pairs."""
+    from .data_recipes.online import OnlinePairs
+    from .data_recipes.recipe import load_recipe
+    from .prior.blend import Online
+
+    sources = []
+    for spec in specs:
+        name, _, number = spec.rpartition("=")
+        try:
+            share = float(number)
+        except ValueError:
+            share = 0.0
+        if not (name and 0.0 < share <= 1.0):
+            raise ValueError(f"train: --online must be RECIPE=SHARE, the share in (0, 1], got {spec!r}")
+        pairs = OnlinePairs(load_recipe(name), seed=ONLINE_SEED + seed, workers=workers, mesh_root=mesh_root)
+        sources.append(Online(Path(name).stem, share, pairs))
+    return sources
+
+
 def train(
     shards: Positional[list[str]],
     out: Path,
@@ -159,6 +181,12 @@ def train(
     threads: int | None = None,
     threshold_from: str | None = None,
     init_from: str | None = None,
+    channels: tuple[str, ...] = (),
+    size: str | None = None,
+    drop_channels: float | None = None,
+    online: UseAppendAction[list[str]] = [],  # noqa: B006
+    online_workers: int = 1,
+    mesh_root: Path | None = None,
     resume: bool = False,
 ) -> None:
     """Train a restoration prior from shards; writes model.safetensors, logs and checkpoints.
@@ -179,21 +207,34 @@ def train(
         threads: of torch; 0 leaves it alone.
         threshold_from: validation names (commas between) whose thresholds, averaged, become the model's.
         init_from: a model.safetensors to start from.
+        channels: what the network sees: signed_opacity, surroundings, view_count; the first alone if not given.
+        size: of the network: xs, s, m or l.
+        drop_channels: share of the cubes of which an optional channel is made unknown.
+        online: RECIPE=SHARE, a recipe whose pairs are made while the network trains and fill that share of every
+            batch; may be given several times. Its samples are those of a seed apart from all that curate is given.
+        online_workers: processes that make them, each recipe's own.
+        mesh_root: folder with the meshes and their manifest.csv, for recipes that read meshes.
         resume: go on where a killed run stopped.
     """
     from .prior.config import TrainConfig
+    from .prior.network import SIZES
     from .prior.train import train as run
 
     given: dict[str, Any] = {
         "name": name, "steps": steps, "max_seconds": max_seconds, "batch_size": batch_size, "seed": seed,
         "learning_rate": learning_rate, "precision": precision, "device": device, "threads": threads,
-        "threshold_from": threshold_from, "init_from": init_from,
+        "threshold_from": threshold_from, "init_from": init_from, "drop_channels": drop_channels,
     }  # fmt: skip
     base = TrainConfig() if config is None else TrainConfig.from_dict(json.loads(config.read_text(encoding="utf-8")))
+    if size is not None and size not in SIZES:
+        raise ValueError(f"train: --size must be one of {', '.join(SIZES)}, got {size!r}")
+    network = base.network if size is None else dataclasses.replace(SIZES[size], channels=base.network.channels)
+    given["network"] = dataclasses.replace(network, channels=channels) if channels else network
     chosen = dataclasses.replace(base, **{key: value for key, value in given.items() if value is not None})
     result = run(
         chosen, train_shards=[pair for spec in shards for pair in expand_shards(spec)],
         validation_shards=_named_shards(validation), out=out, resume=resume, progress=True,
+        online=_online(online, seed=chosen.seed, workers=online_workers, mesh_root=mesh_root),
     )  # fmt: skip
     print(f"{result.steps} steps in {result.seconds:.0f} s, ended by {result.reason}; model: {result.model}")
     for shard, row in result.validation.items():

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from unghost.core.aabb import contains
+from unghost.core.cube_views import count_views
 from unghost.core.frames import cube_lattices
 from unghost.core.occupancy import FREE_LABEL, IGNORE_LABEL, opacity_from_density
 from unghost.core.shards import dequantize_signed, read_shard, unpack_frame, unpack_labels
@@ -12,7 +13,6 @@ from unghost.data_recipes import harvest as module
 from unghost.data_recipes import harvest_config
 from unghost.data_recipes.harvest import harvest, harvest_scene, room_scene
 from unghost.data_recipes.harvest_config import HarvestConfig
-from unghost.data_recipes.harvest_context import count_views
 from unghost.data_recipes.harvest_labels import Truth, severity_of
 
 torch = pytest.importorskip("torch")

@@ -77,7 +77,7 @@ def test_errors(exported, make_lively, tmp_path):
     with pytest.raises(ValueError, match="cubes must be >= 1"):
         parity_inputs(0, 0)
     manifest = dataclasses.replace(exported.manifest, channels=("signed_opacity", "surroundings"))
-    network = make_lively(NetworkConfig(channels=2, widths=(8, 8, 8)))
+    network = make_lively(NetworkConfig(channels=manifest.channels, widths=(8, 8, 8)))
     save_model(tmp_path / "two.safetensors", network, manifest)
     with pytest.raises(ValueError, match="surroundings"):
         verify(exported.onnx, tmp_path / "two.safetensors", cubes=1)

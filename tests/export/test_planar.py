@@ -4,6 +4,7 @@ import onnxruntime
 import pytest
 import torch
 
+from unghost.core.channels import CHANNEL_NAMES
 from unghost.export.graph import OPERATORS, OPSET
 from unghost.export.planar import planar_model
 from unghost.prior.network import SIZES, NetworkConfig
@@ -12,7 +13,11 @@ CONFIGS = {
     "tiny": NetworkConfig(widths=(8, 16, 24), condition_width=8),
     "no block at 4^3": NetworkConfig(widths=(8, 8, 16), blocks=(1, 0, 2), condition_width=8),
     "only 4^3": NetworkConfig(widths=(16, 8, 8), blocks=(0, 2, 0), condition_width=8),
-    "three channels": NetworkConfig(channels=3, widths=(8, 8, 8), condition_width=8),
+    "all channels": NetworkConfig(channels=CHANNEL_NAMES, widths=(8, 16, 8), condition_width=8),
+    "with views": NetworkConfig(channels=("signed_opacity", "view_count"), widths=(8, 8, 8), condition_width=8),
+    "another order": NetworkConfig(
+        channels=("signed_opacity", "view_count", "surroundings"), widths=(8, 8, 8), condition_width=8
+    ),
     "default": SIZES["m"],
 }
 
@@ -31,7 +36,7 @@ def make_inputs(count, channels, seed=0):
 @pytest.mark.parametrize("name", CONFIGS)
 def test_planar_twin_equals_the_3d_network(name, make_lively):
     network = make_lively(CONFIGS[name])
-    inputs = make_inputs(3, network.config.channels)
+    inputs = make_inputs(3, len(network.config.channels))
     with torch.no_grad():
         expected = network(*(torch.from_numpy(value) for value in inputs)).numpy()
     found = run(planar_model(network), *inputs)

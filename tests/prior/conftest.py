@@ -37,13 +37,23 @@ def make_pairs(count: int, seed: int) -> dict[str, np.ndarray]:
     }  # fmt: skip
 
 
+def make_context(count: int, seed: int) -> dict[str, np.ndarray]:
+    """Surroundings and view counts without meaning or symmetry."""
+    rng = np.random.default_rng([seed, 1])
+    return {
+        "surroundings": rng.integers(0, 256, (count, 16, 16, 16), dtype=np.uint8),
+        "view_count": rng.integers(0, 40, (count, 32, 32, 32), dtype=np.uint8),
+    }
+
+
 @pytest.fixture(scope="session")
 def shard_paths(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Three shards: ``a`` (12 cubes), ``b`` (7), ``held_out`` (10)."""
+    """Three shards: ``a`` (12 cubes), ``b`` (7), ``held_out`` (10); and ``seen`` (9) with surroundings and views."""
     root = tmp_path_factory.mktemp("shards")
     for seed, (name, count) in enumerate({"a": 12, "b": 7, "held_out": 10}.items()):
         write_shard(root / name, make_pairs(count, seed), {"seed": seed})
-    return {name: root / name for name in ("a", "b", "held_out")}
+    write_shard(root / "seen", make_pairs(9, 5) | make_context(9, 5), {"seed": 5, "recipe": "harvest"})
+    return {name: root / name for name in ("a", "b", "held_out", "seen")}
 
 
 @pytest.fixture

@@ -1,8 +1,19 @@
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from unghost.core.channels import CHANNEL_NAMES, UNKNOWN, encode_surroundings, encode_view_count, full_channel
 from unghost.core.shards import dequantize_signed, read_shard, unpack_labels, write_shard
-from unghost.prior.batches import BLIND_SEVERITY, DEPTH_JITTER, SYMMETRIES, Mixture, apply_symmetry, scale_depth
+from unghost.prior.batches import (
+    BLIND_SEVERITY,
+    DEPTH_JITTER,
+    SYMMETRIES,
+    Mixture,
+    apply_symmetry,
+    scale_depth,
+    stored_channels,
+)
 
 
 def test_symmetries_are_the_48_of_the_cube():
@@ -62,7 +73,7 @@ def test_timesteps_lie_between_severity_and_the_end(shard_paths):
     mixture = Mixture([(shard_paths["a"], 1.0)], seed=0)
     times = {index: [] for index in range(len(shard))}
     for index in range(400):
-        _, cube, *_ = mixture._draw(index)
+        cube = mixture._draw(index).cube
         times[cube].append(int(mixture.batch(index, 1).timestep[0]))
     for cube, drawn in times.items():
         assert min(drawn) >= np.rint(999 * min(shard.severity[cube], BLIND_SEVERITY))
@@ -73,14 +84,14 @@ def test_timesteps_lie_between_severity_and_the_end(shard_paths):
 
 def test_weights_of_the_mixture(shard_paths):
     mixture = Mixture([(shard_paths["a"], 1.0), (shard_paths["b"], 3.0)], seed=0)
-    share = np.mean([mixture._draw(index)[0] is mixture.shards[1] for index in range(2000)])
+    share = np.mean([mixture._draw(index).shard is mixture.shards[1] for index in range(2000)])
     assert share == pytest.approx(0.75, abs=0.04)
 
 
 def test_values_come_from_the_shard(shard_paths):
     shard = read_shard(shard_paths["b"])
     mixture = Mixture([(shard_paths["b"], 1.0)], seed=0)
-    _, cube, symmetry, *_ = mixture._draw(9)
+    cube, symmetry = mixture._draw(9).cube, mixture._draw(9).symmetry
     batch = mixture.batch(9, 1)
     assert np.array_equal(batch.channels[0, 0], apply_symmetry(dequantize_signed(shard.inputs[cube]), symmetry))
     assert np.array_equal(batch.labels[0], apply_symmetry(unpack_labels(shard.labels[cube : cube + 1])[0], symmetry))
@@ -134,3 +145,86 @@ def test_errors(shard_paths, tmp_path):
     write_shard(tmp_path / "none", {name: getattr(shard, name)[:0] for name in names}, {})
     with pytest.raises(ValueError, match="holds no cubes"):
         Mixture([(tmp_path / "none", 1.0)], seed=0)
+
+
+@settings(max_examples=48, deadline=None)
+@given(st.integers(0, 47), st.integers(0, 2**32 - 1))
+def test_symmetries_turn_all_grids_alike(symmetry, seed):
+    """A symmetry commutes with what joins the grids: pooling the fine one, repeating the coarse one."""
+    rng = np.random.default_rng(seed)
+    fine, coarse = rng.normal(size=(8, 8, 8)), rng.normal(size=(16, 16, 16)).astype(np.float32)
+    pooled = fine.reshape(4, 2, 4, 2, 4, 2).mean(axis=(1, 3, 5))
+    turned = apply_symmetry(fine, symmetry).reshape(4, 2, 4, 2, 4, 2).mean(axis=(1, 3, 5))
+    np.testing.assert_allclose(apply_symmetry(pooled, symmetry), turned, rtol=1e-12)
+    assert np.array_equal(
+        full_channel(apply_symmetry(coarse, symmetry)), apply_symmetry(full_channel(coarse), symmetry)
+    )
+
+
+def test_all_channels_and_the_labels_move_together(shard_paths):
+    """Each sample equals its stored cube under one symmetry, applied to everything."""
+    shard = read_shard(shard_paths["seen"])
+    mixture = Mixture([(shard_paths["seen"], 1.0)], seed=2, channels=CHANNEL_NAMES)
+    batch, seen = mixture.batch(0, 30), set()
+    for row in range(30):
+        draw = mixture._draw(row)
+        seen.add(draw.symmetry)
+        coarse = scale_depth(dequantize_signed(shard.surroundings[draw.cube]), draw.depth)
+        expected = [
+            scale_depth(dequantize_signed(shard.inputs[draw.cube]), draw.depth),
+            full_channel(encode_surroundings(coarse)),
+            encode_view_count(shard.view_count[draw.cube]),
+        ]
+        for found, grid in zip(batch.channels[row], expected):
+            np.testing.assert_array_equal(found, apply_symmetry(grid, draw.symmetry))
+        labels = unpack_labels(shard.labels[draw.cube : draw.cube + 1])[0]
+        np.testing.assert_array_equal(batch.labels[row], apply_symmetry(labels, draw.symmetry))
+    assert len(seen) > 15
+
+
+def test_optional_channels_are_dropped_one_by_one(shard_paths):
+    mixture = Mixture([(shard_paths["seen"], 1.0)], seed=0, channels=CHANNEL_NAMES, drop_channels=0.3)
+    gone = (mixture.batch(0, 300).channels == UNKNOWN).all(axis=(2, 3, 4))
+    assert not gone[:, 0].any()
+    np.testing.assert_allclose(gone[:, 1:].mean(axis=0), 0.3, atol=0.08)
+    assert (gone[:, 1] & gone[:, 2]).mean() == pytest.approx(0.09, abs=0.05)
+    whole = Mixture([(shard_paths["seen"], 1.0)], seed=0, channels=CHANNEL_NAMES).batch(0, 300)
+    assert not (whole.channels[:, 1:] == UNKNOWN).any()
+    kept = ~gone[:, 2]
+    assert np.array_equal(mixture.batch(0, 300).channels[kept, 2], whole.channels[kept, 2])  # all else stays
+
+
+def test_what_a_shard_does_not_store_is_unknown(shard_paths):
+    names = ("signed_opacity", "view_count", "surroundings")
+    batch = Mixture([(shard_paths["a"], 1.0), (shard_paths["seen"], 1.0)], seed=0, channels=names).batch(0, 40)
+    known = ~(batch.channels[:, 1:] == UNKNOWN).any(axis=(2, 3, 4))
+    assert np.array_equal(known[:, 0], batch.harvested)
+    assert np.array_equal(known[:, 1], batch.harvested)
+    assert 10 < batch.harvested.sum() < 30
+
+
+def test_further_channels_change_no_other_draw(shard_paths):
+    """The samples of a seed are the same ones whatever the network sees of them."""
+    shards = [(shard_paths["a"], 1.0), (shard_paths["seen"], 1.0)]
+    one = Mixture(shards, seed=7).batch(2, 8)
+    all_ = Mixture(shards, seed=7, channels=CHANNEL_NAMES, drop_channels=0.5).batch(2, 8)
+    assert np.array_equal(one.channels[:, 0], all_.channels[:, 0])
+    for name in ("labels", "timestep", "edge_fraction", "harvested"):
+        assert np.array_equal(getattr(one, name), getattr(all_, name))
+
+
+def test_stored_channels(shard_paths):
+    shard, index = read_shard(shard_paths["seen"]), np.array([4, 0])
+    found = stored_channels(shard, index, CHANNEL_NAMES)
+    assert found.shape == (2, 3, 32, 32, 32)
+    np.testing.assert_array_equal(found[:, 2], encode_view_count(shard.view_count[index]))
+    blind = stored_channels(shard, index, CHANNEL_NAMES, without=("view_count",))
+    np.testing.assert_array_equal(blind[:, :2], found[:, :2])
+    assert (blind[:, 2] == UNKNOWN).all()
+
+
+def test_bad_channels_are_refused(shard_paths):
+    with pytest.raises(ValueError, match="Mixture: channels must start with"):
+        Mixture([(shard_paths["a"], 1.0)], seed=0, channels=("view_count",))
+    with pytest.raises(ValueError, match="Mixture: drop_channels must lie in"):
+        Mixture([(shard_paths["a"], 1.0)], seed=0, drop_channels=1.5)

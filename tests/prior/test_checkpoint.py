@@ -99,10 +99,10 @@ def test_weights_that_do_not_fit_or_are_not_finite(saved, tmp_path):
 
 def test_manifest_and_network_must_agree_on_channels(tmp_path):
     manifest = Manifest(name="two", channels=("signed_opacity", "surroundings"))
-    with pytest.raises(ValueError, match="names 2 channels, the network takes 1"):
+    with pytest.raises(ValueError, match=r"names the channels .*surroundings.*, the network takes"):
         save_model(tmp_path / "model.safetensors", RestorationNet(TINY), manifest)
     assert not list(tmp_path.iterdir())
-    with pytest.raises(ValueError, match="names 2 channels"):
+    with pytest.raises(ValueError, match="names the channels"):
         TorchDenoiser(RestorationNet(TINY), manifest)
 
 

@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -5,6 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn import functional
 
+from unghost.core.channels import CHANNEL_NAMES, LEAST_KNOWN, UNKNOWN
+from unghost.prior.context import context_features, interpolation
 from unghost.prior.network import (
     SIZES,
     NetworkConfig,
@@ -131,8 +135,78 @@ def test_every_output_depends_on_far_away_input():
     assert cubes.grad[0, 0, 16:, 16:, 16:].abs().max() > 0
 
 
+WEIGHTS_OF_ONE_CHANNEL = {
+    "stem": (8, 8, 3, 3, 3), "down_middle": (16, 8, 2, 2, 2), "down_coarse": (8, 16, 2, 2, 2), "head": (8, 8, 3, 3, 3),
+    "condition.0": (8, 18), "condition.2": (8, 8), "condition.4": (40, 8), "up_middle.mix": (128, 8, 1, 1, 1),
+    "up_fine.mix": (64, 16, 1, 1, 1),
+}  # fmt: skip
+
+
+def test_a_network_of_one_channel_keeps_its_layout():
+    """Published weights have these names and shapes."""
+    state = make_network().state_dict()
+    for name, shape in WEIGHTS_OF_ONE_CHANNEL.items():
+        assert tuple(state[f"{name}.weight"].shape) == shape
+    assert not [name for name in state if "context" in name]
+    assert len(state) == 28
+    assert NetworkConfig.from_dict({"channels": 1, "widths": [8, 16, 8], "condition_width": 8}) == TINY
+    with pytest.raises(ValueError, match="channels must start with"):
+        NetworkConfig.from_dict({"channels": ["surroundings"]})
+
+
+def test_each_channel_moves_the_output_and_gets_gradients():
+    names = ("signed_opacity", "view_count", "surroundings")
+    network, (cubes, times, edges) = make_network(NetworkConfig(channels=names, widths=(8, 16, 8))), make_inputs(2, 3)
+    with torch.no_grad():
+        before = network(cubes, times, edges)
+        for channel in range(3):
+            other = cubes.clone()
+            other[:, channel] = -1.0
+            assert (network(other, times, edges) - before).abs().max() > 1e-4, names[channel]
+    network.train().logits(cubes, times, edges).square().mean().backward()
+    for name, value in network.named_parameters():
+        assert value.grad.abs().max() > 0, name
+
+
+def test_surroundings_unknown_and_empty_are_told_apart():
+    config = NetworkConfig(channels=("signed_opacity", "surroundings"), widths=(8, 16, 8))
+    network, (cubes, times, edges) = make_network(config), make_inputs(1, 2)
+    empty, unknown = cubes.clone(), cubes.clone()
+    empty[:, 1], unknown[:, 1] = LEAST_KNOWN, UNKNOWN
+    with torch.no_grad():
+        assert (network(empty, times, edges) - network(unknown, times, edges)).abs().max() > 1e-5
+
+
+def test_context_features_by_hand():
+    channel = torch.tensor([UNKNOWN, LEAST_KNOWN, -0.125, 1.0]).repeat_interleave(2).reshape(1, 1, 8, 1, 1)
+    found = context_features(channel.expand(1, 1, 8, 2, 2))
+    assert found.shape == (1, 2, 4, 1, 1)
+    # opacities (less than 0 counts as) 0, 0, .25, 1
+    assert found[0, 0].flatten().tolist() == pytest.approx([-1.0, -1.0, 0.0, 1.0], abs=1e-6)
+    assert found[0, 1].flatten().tolist() == pytest.approx([1.0, 0.0, 0.0, 0.0], abs=1e-6)
+
+
+def test_what_lies_about_the_cube_is_put_where_it_is():
+    """A ramp along one axis of the surroundings, handed through, is the same ramp on the cube's grid."""
+    part, weights = interpolation()
+    places = 3 * ((torch.arange(8) + 0.5) / 8 - 0.5)
+    for axis in range(3):
+        ramp = places.reshape([8 if i == axis else 1 for i in range(3)]).expand(8, 8, 8)
+        fine = (ramp[part, part, part].reshape(1, -1) @ torch.from_numpy(weights)).reshape(8, 8, 8)
+        expected = ((torch.arange(8) + 0.5) / 8 - 0.5).reshape([8 if i == axis else 1 for i in range(3)])
+        torch.testing.assert_close(fine, expected.expand(8, 8, 8), rtol=0, atol=1e-6)
+
+
+def test_further_channels_are_cheap():
+    one, all_ = (gflop(NetworkConfig(channels=CHANNEL_NAMES[:count])) for count in (1, 3))
+    assert all_ < 1.15 * one
+
+
 def test_inputs_unchanged_and_extra_channels_used():
-    network, (cubes, times, edges) = make_network(NetworkConfig(channels=3, widths=(8, 8, 8))), make_inputs(1, 3)
+    network, (cubes, times, edges) = (
+        make_network(NetworkConfig(channels=CHANNEL_NAMES, widths=(8, 8, 8))),
+        make_inputs(1, 3),
+    )
     kept = cubes.clone()
     with torch.no_grad():
         first = network(cubes, times, edges)
@@ -150,27 +224,30 @@ def test_parameters_and_work_of_the_sizes():
     assert work == sorted(work)
 
 
-def test_gflop_counts_what_runs():
+@pytest.mark.parametrize("count", [1, 3])
+def test_gflop_counts_what_runs(count):
     """Against the multiply-adds of each convolution, seen by hooks."""
-    network, total = make_network(), []
+    config = dataclasses.replace(TINY, channels=CHANNEL_NAMES[:count])
+    network, total = make_network(config), []
 
-    def count(module, _inputs, output):
+    def work(module, _inputs, output):
         kernel = module.weight[0].numel()
         total.append(2 * output[0].numel() * kernel)
 
     for module in network.modules():
         if isinstance(module, torch.nn.Conv3d):
-            module.register_forward_hook(count)
+            module.register_forward_hook(work)
     with torch.no_grad():
-        network(*make_inputs(1))
+        network(*make_inputs(1, count))
     missed = 2 * (4**3 * 8 * 8 * 16 + 8**3 * 8 * 16 * 8)  # Upsample calls the functional form
-    assert (sum(total) + missed) / 1e9 == pytest.approx(gflop(TINY), rel=1e-9)
+    missed += 2 * 8 * 4**3 * 8**3 if count == 3 else 0  # the interpolation is no module
+    assert (sum(total) + missed) / 1e9 == pytest.approx(gflop(config), rel=1e-9)
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"channels": 0}, "channels must be >= 1"),
+        ({"channels": ("view_count",)}, "channels must start with"),
         ({"widths": (8, 8)}, "three multiples of 8"),
         ({"widths": (8, 8, 12)}, "three multiples of 8"),
         ({"blocks": (0, 0, 0)}, "not all 0"),

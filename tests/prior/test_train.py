@@ -10,8 +10,12 @@ import textwrap
 import pytest
 import torch
 
+from unghost.core.channels import CHANNEL_NAMES
+from unghost.data_recipes.online import OnlinePairs
+from unghost.data_recipes.recipe import load_recipe
 from unghost.prior import train as train_module
 from unghost.prior.batches import Batch, Mixture
+from unghost.prior.blend import Online
 from unghost.prior.checkpoint import load_model, read_tensors
 from unghost.prior.config import TrainConfig
 from unghost.prior.train import train
@@ -86,6 +90,34 @@ def test_resumed_run_has_the_bits_of_one_that_was_not_killed(tiny_config, shards
     assert set(first) == set(second)
     assert all(torch.equal(first[name], second[name]) for name in first)
     assert any(name.startswith("optimizer.0.exp_avg") for name in first)
+
+
+def test_all_channels_and_an_online_recipe_resume_with_the_same_bits(tiny_config, shard_paths, tmp_path):
+    network = dataclasses.replace(tiny_config.network, channels=CHANNEL_NAMES)
+    config = dataclasses.replace(tiny_config, network=network, steps=4, checkpoint_steps=2, drop_channels=0.3)
+
+    def run(out, **more):
+        online = [Online("procedural", 0.3, OnlinePairs(load_recipe("procedural"), seed=11))]
+        shards = [(shard_paths["seen"], 1.0)]
+        return train(config, train_shards=shards, validation_shards={"seen": shard_paths["seen"]}, online=online,
+                     out=tmp_path / out, progress=False, **more)  # fmt: skip
+
+    whole = run("whole")
+    with pytest.raises(Killed):
+        run("parts", on_step=kill_after(3))
+    resumed = run("parts", resume=True)
+    first, second = (read_tensors(tmp_path / name / "state.safetensors")[0] for name in ("whole", "parts"))
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    assert whole.validation == resumed.validation
+    manifest = load_model(resumed.model).manifest
+    assert manifest.channels == CHANNEL_NAMES
+    assert manifest.training["online"] == [{"name": "procedural", "share": 0.3}]
+    assert manifest.training["drop_channels"] == 0.3
+    plain = train(config, train_shards=[(shard_paths["seen"], 1.0)], out=tmp_path / "plain", progress=False)
+    others = load_model(plain.model).network.state_dict()
+    assert not all(
+        torch.equal(value, others[name]) for name, value in load_model(whole.model).network.state_dict().items()
+    )
 
 
 def test_other_seed_gives_other_bits(tiny_config, shards, tmp_path):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from unghost.core.channels import CHANNEL_NAMES
 from unghost.core.manifest import Manifest
 from unghost.prior.batches import Batch, Mixture
 from unghost.prior.checkpoint import save_model
@@ -121,3 +122,13 @@ def test_bf16_training_runs_and_keeps_fp32_weights(tiny_config, batch):
     losses = [trainer.learn(batch)["loss"] for _ in range(20)]
     assert losses[-1] < 0.8 * losses[0]
     assert trainer.network.stem.weight.dtype == torch.float32
+
+
+@pytest.mark.parametrize("precision", ["fp32", "bf16"])
+def test_all_channels_train_in_both_precisions(tiny_config, shard_paths, precision):
+    network = dataclasses.replace(tiny_config.network, channels=CHANNEL_NAMES)
+    trainer = Trainer(dataclasses.replace(tiny_config, network=network, precision=precision, steps=40))
+    batch = Mixture([(shard_paths["seen"], 1.0)], seed=0, channels=CHANNEL_NAMES).batch(0, 4)
+    losses = [trainer.learn(batch)["loss"] for _ in range(20)]
+    assert losses[-1] < 0.8 * losses[0]
+    assert any(name.startswith("context.") for name in trainer.average.shadow)

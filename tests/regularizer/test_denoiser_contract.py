@@ -1,11 +1,13 @@
 """What every denoiser must do: analytic ones here, and all that are shipped, with every engine."""
 
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
+from unghost.core.channels import CHANNEL_NAMES
 from unghost.core.manifest import Manifest
 from unghost.denoisers import load_denoiser, shipped_names
 from unghost.regularizer.clean import clean
@@ -14,8 +16,25 @@ from unghost.regularizer.regularizer import DensityRegularizer
 NAMES = [
     "analytic-numpy",
     "analytic-torch",
+    "all_channels-onnx",
+    "all_channels-torch",
     *[f"{name}-{kind}" for name in shipped_names() for kind in ("onnx", "torch")],
 ]
+
+
+@pytest.fixture(scope="module")
+def all_channels(tmp_path_factory):
+    """A small network of all channels with fresh weights, by both engines."""
+    from unghost.export.to_onnx import export_onnx
+    from unghost.prior.checkpoint import save_model
+    from unghost.prior.network import NetworkConfig, RestorationNet
+
+    folder = tmp_path_factory.mktemp("all_channels")
+    torch.manual_seed(0)
+    network = RestorationNet(NetworkConfig(channels=CHANNEL_NAMES, widths=(8, 16, 8), condition_width=8))
+    save_model(folder / "m.safetensors", network, Manifest("all channels", channels=CHANNEL_NAMES))
+    export_onnx(folder / "m.safetensors", folder / "m.onnx")
+    return SimpleNamespace(onnx=load_denoiser(folder / "m.onnx"), torch=load_denoiser(folder / "m.safetensors"))
 
 
 @cache
@@ -29,6 +48,8 @@ def denoiser(request, kit):
     if name == "analytic":
         make = kit.numpy_denoiser if kind == "numpy" else kit.torch_denoiser
         return make(lambda channels: np.clip(channels * 1.5, -1, 1))
+    if name == "all_channels":
+        return getattr(request.getfixturevalue("all_channels"), kind)
     return shipped(name, kind)
 
 
@@ -40,16 +61,16 @@ def ask(denoiser, channels, timestep, fraction):
         return denoiser(torch.from_numpy(channels), torch.from_numpy(timestep), torch.from_numpy(fraction)).numpy()
 
 
-def inputs(count, seed=0, value=None):
-    rng = np.random.default_rng(seed)
-    channels = rng.uniform(-1, 1, (count, 1, 32, 32, 32)).astype(np.float32)
+def inputs(denoiser, count, value=None):
+    rng = np.random.default_rng(0)
+    channels = rng.uniform(-1, 1, (count, len(denoiser.manifest.channels), 32, 32, 32)).astype(np.float32)
     if value is not None:
         channels[:] = value
     return channels, np.full(count, 500, np.int64), rng.uniform(0.02, 0.5, count).astype(np.float32)
 
 
 def test_shape_type_and_inputs_unchanged(denoiser):
-    given = inputs(3)
+    given = inputs(denoiser, 3)
     before = [array.copy() for array in given]
     answer = ask(denoiser, *given)
     assert answer.shape == (3, 1, 32, 32, 32)
@@ -60,7 +81,7 @@ def test_shape_type_and_inputs_unchanged(denoiser):
 
 
 def test_a_cube_of_a_batch_equals_the_cube_alone(denoiser):
-    channels, timestep, fraction = inputs(5)
+    channels, timestep, fraction = inputs(denoiser, 5)
     timestep = np.array([0, 100, 500, 900, 999], dtype=np.int64)
     whole = ask(denoiser, channels, timestep, fraction)
     for index in (0, 3):
@@ -72,19 +93,19 @@ def test_a_cube_of_a_batch_equals_the_cube_alone(denoiser):
 @pytest.mark.parametrize("value", [-1.0, 1.0, 0.0])
 @pytest.mark.parametrize("timestep", [0, 999])
 def test_uniform_cubes_at_extreme_times(denoiser, value, timestep):
-    channels, steps, fraction = inputs(1, value=value)
+    channels, steps, fraction = inputs(denoiser, 1, value=value)
     steps[:] = timestep
     assert np.isfinite(ask(denoiser, channels, steps, fraction)).all()
 
 
 def test_an_empty_cube_stays_empty(denoiser):
-    assert (ask(denoiser, *inputs(2, value=-1.0)) < denoiser.manifest.removal_threshold).mean() > 0.99
+    assert (ask(denoiser, *inputs(denoiser, 2, value=-1.0)) < denoiser.manifest.removal_threshold).mean() > 0.99
 
 
 def test_scalars_broadcast(denoiser, kit):
     if isinstance(denoiser, kit.numpy_denoiser):
         pytest.skip("the analytic ones are only called with arrays")
-    channels, timestep, fraction = inputs(2)
+    channels, timestep, fraction = inputs(denoiser, 2)
     fraction[:] = 0.1
     whole = ask(denoiser, channels, timestep, fraction)
     if denoiser.kind == "numpy":
@@ -99,12 +120,12 @@ def test_manifest_round_trip(denoiser):
     assert Manifest.from_json(denoiser.manifest.to_json(), origin="test") == denoiser.manifest
 
 
-def test_it_drives_the_regularizer_and_clean(denoiser, kit, aabb):
+def test_it_drives_the_regularizer_and_clean(denoiser, kit, aabb, lone_camera):
     field = kit.field(np.pad(np.full((6, 6, 6), 40.0), 5))
-    regularizer = DensityRegularizer(denoiser, aabb=aabb, field_pitch=0.125, cubes=2)
+    regularizer = DensityRegularizer(denoiser, aabb=aabb, cameras=lone_camera, field_pitch=0.125, cubes=2)
     loss = regularizer(field)["dsds"]
     assert torch.isfinite(loss)
     loss.backward()
     assert field.values.grad.abs().sum() > 0
-    mask = clean(field, aabb, denoiser=denoiser, field_pitch=0.125)
+    mask = clean(field, aabb, denoiser=denoiser, cameras=lone_camera, field_pitch=0.125)
     assert mask.cells.shape == (16, 16, 16)

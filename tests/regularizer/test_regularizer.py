@@ -233,9 +233,6 @@ def test_construction_errors(kit, aabb):
         build(kit, aabb, kit.identity, timestep=1000)
     with pytest.raises(ValueError, match="fill_threshold must be >= threshold"):
         build(kit, aabb, kit.identity, threshold=0.5, fill_threshold=0.0)
-    denoiser = kit.numpy_denoiser(kit.identity, channels=("signed_opacity", "view_count"))
-    with pytest.raises(ValueError, match="signed_opacity"):
-        DensityRegularizer(denoiser, aabb=aabb)
     with pytest.raises(TypeError, match="must be callable and have a manifest"):
         DensityRegularizer(lambda c, t, e: c, aabb=aabb)
 

@@ -1,0 +1,81 @@
+"""The optional channels of a denoiser, for cubes of a field that is being trained (torch)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..core.aabb import contains
+from ..core.cameras import Cameras
+from ..core.channels import (
+    SURROUNDINGS,
+    VIEW_COUNT,
+    encode_surroundings,
+    pool_surroundings,
+    stack_channels,
+    surroundings_lattice,
+)
+from ..core.occupancy import EMPTY, OccupancyRule
+from .context import view_channel
+from .cubes import CubeBatch
+from .losses import widest
+
+Ask = Callable[[Tensor], Tensor]
+
+
+@torch.no_grad()
+def cube_surroundings(
+    ask: Ask, cubes: CubeBatch, asked: Tensor, *, aabb: NDArray[np.float64], rule: OccupancyRule, soft: bool
+) -> NDArray[np.float32]:
+    """Mean signed opacity about some of the cubes, ``(n, 16, 16, 16)``, empty outside the box; no gradient.
+
+    Args:
+        ask: positions ``(M, 3)`` float32 to densities ``(M,)``.
+        cubes: all of a step's.
+        asked: ``(N,)`` bool, which of them.
+        aabb: ``(2, 3)``.
+        rule, soft: how the cubes themselves are encoded, over the same pitch.
+    """
+    some, device = asked.cpu().numpy(), cubes.pitch.device
+    lattice = surroundings_lattice(cubes.centers[some], cubes.edges[some])
+    inside = torch.from_numpy(contains(aabb, lattice)).to(device)
+    positions = torch.as_tensor(lattice, dtype=torch.float32, device=device)[inside]
+    pitch = cubes.pitch[asked].expand(inside.shape)[inside]
+    values = rule.encode(widest(ask(positions)), pitch, soft=soft).float()
+    signed = torch.full(inside.shape, EMPTY, device=device).masked_scatter(inside, values)
+    return pool_surroundings(signed.cpu().numpy())
+
+
+def complete_channels(
+    names: tuple[str, ...],
+    signed: Tensor,
+    cubes: CubeBatch,
+    asked: Tensor,
+    *,
+    viewing: Cameras | None,
+    surroundings: Callable[[], NDArray[np.float32]],
+) -> Tensor:
+    """All channels of the cubes that are asked about; what cannot be told is unknown.
+
+    Args:
+        names: of the channels.
+        signed: ``(n, 1, R, R, R)``, the first of them.
+        cubes, asked: as :func:`cube_surroundings` has them.
+        viewing: cameras to count, or None.
+        surroundings: called if the denoiser wants them.
+
+    Returns:
+        ``(n, C, R, R, R)``, where ``signed`` is.
+    """
+    some, known = asked.cpu().numpy(), {}
+    if viewing is not None:
+        known[VIEW_COUNT] = view_channel(viewing, cubes.centers[some], cubes.edges[some])
+    if SURROUNDINGS in names:
+        known[SURROUNDINGS] = encode_surroundings(surroundings())
+    nothing = np.broadcast_to(np.float32(EMPTY), (len(signed), *signed.shape[2:]))
+    others = torch.from_numpy(stack_channels(names, nothing, known)[:, 1:])
+    return torch.cat([signed, others.to(signed.device)], dim=1)

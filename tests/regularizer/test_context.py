@@ -1,0 +1,178 @@
+"""What a denoiser of more channels is told, by the cleaner and by the regularizer."""
+
+import numpy as np
+import pytest
+import torch
+
+from unghost.core.cameras import Cameras
+from unghost.core.channels import (
+    CHANNEL_NAMES,
+    UNKNOWN,
+    coarse_channel,
+    encode_surroundings,
+    encode_view_count,
+)
+from unghost.core.cube_views import count_views
+from unghost.core.frames import random_rotations, unit_lattice
+from unghost.data_recipes.harvest_context import surroundings
+from unghost.regularizer.clean import clean
+from unghost.regularizer.context import GridContext, viewing_cameras
+from unghost.regularizer.cubes import draw_cubes
+from unghost.regularizer.regularizer import DensityRegularizer
+
+PITCH = 0.05
+
+
+def keep_first(channels):
+    return channels[:, :1]
+
+
+def waves(positions):
+    """Fog of gentle waves, optical depths of about half a cell, for arrays; per scene unit."""
+    x, y, z = np.moveaxis(np.asarray(positions, dtype=np.float64), -1, 0)
+    return ((1.2 + np.sin(4 * x + y) + 0.2 * np.cos(7 * z - x)) / (2 * PITCH)).astype(np.float32)
+
+
+def waves_of_tensors(positions):
+    return torch.from_numpy(waves(positions.detach().cpu().numpy()))
+
+
+@pytest.fixture
+def crowd():
+    rng = np.random.default_rng(4)
+    poses = np.concatenate([random_rotations(rng, 9), rng.uniform(-1, 1, size=(9, 3, 1))], axis=2)
+    return Cameras.create(poses, np.array([30.0, 30.0, 20.0, 15.0]), 40, 30)
+
+
+def windows(corners, origin, pitch):
+    """Centres and edges of windows of 32 cells."""
+    return origin + (np.array(corners) + 16) * pitch, np.full(len(corners), 32 * pitch)
+
+
+CORNERS = [(0, 0, 0), (5, -20, 31), (8, 8, 8), (-16, 24, 1)]
+
+
+def test_a_grid_holds_the_surroundings_of_its_windows(aabb):
+    """Exactly what asking the field again would give, outside the box too."""
+    cells = 40
+    origin, pitch = aabb[0], 2.0 / cells
+    places = origin + (np.indices((cells,) * 3).transpose(1, 2, 3, 0) + 0.5) * pitch
+    signed = 1 - 2 * np.exp(-waves(places) * PITCH)
+    context = GridContext(CHANNEL_NAMES, signed.astype(np.float32), origin=origin, pitch=pitch)
+    found = context.known(CORNERS)
+    assert set(found) == {"surroundings"}
+    centers, edges = windows(CORNERS, origin, pitch)
+    upright, assumed = np.broadcast_to(np.eye(3), (4, 3, 3)), np.full(4, PITCH)
+    expected = surroundings(lambda p: waves(p), centers, edges, upright, assumed, aabb)
+    assert expected.std() > 0.1
+    assert (expected == -1).any()
+    np.testing.assert_allclose(found["surroundings"], encode_surroundings(expected), atol=1e-5)
+
+
+def test_views_of_windows_are_those_of_cubes(crowd):
+    signed, origin, pitch = np.full((40, 40, 40), -1, np.float32), np.array([-1.0, -0.9, -1.1]), 0.05
+    context = GridContext(("signed_opacity", "view_count"), signed, origin=origin, pitch=pitch, cameras=crowd)
+    found = context.known(CORNERS)["view_count"]
+    centers, edges = windows(CORNERS, origin, pitch)
+    expected = encode_view_count(count_views(crowd, centers, edges, np.broadcast_to(np.eye(3), (4, 3, 3))))
+    assert len(np.unique(expected)) > 3
+    assert (found != expected).mean() < 1e-4  # within rounding of a side
+    assert len(context._tiles) < 8 * len(CORNERS)
+
+
+def test_nobody_counts_for_a_denoiser_that_does_not_ask(crowd):
+    assert viewing_cameras(crowd, ("signed_opacity", "surroundings")) is None
+    assert viewing_cameras(None, CHANNEL_NAMES) is None
+    assert viewing_cameras(crowd.select([]), CHANNEL_NAMES) is None
+    assert viewing_cameras(crowd, CHANNEL_NAMES) is crowd
+    bent = Cameras(crowd.camera_to_world, crowd.intrinsics, 40, 30, np.full((9, 6), 1e-3))
+    assert not viewing_cameras(bent, CHANNEL_NAMES).distortion.any()
+
+
+@pytest.mark.parametrize("kind", ["numpy_denoiser", "torch_denoiser"])
+def test_cleaning_tells_all_it_knows(kit, aabb, crowd, kind):
+    seen, told, alone = (
+        getattr(kit, kind)(keep_first, channels=names)
+        for names in (CHANNEL_NAMES, ("signed_opacity", "view_count", "surroundings"), CHANNEL_NAMES[:1])
+    )
+    options = {"field_pitch": PITCH, "level_weights": (1.0,)}
+    clean(waves, aabb, denoiser=seen, **options)
+    clean(waves, aabb, denoiser=told, cameras=crowd, **options)
+    clean(waves, aabb, denoiser=alone, cameras=crowd, **options)
+    blind, all_, one = (np.concatenate([call[0] for call in d.calls]) for d in (seen, told, alone))
+    assert blind.shape == all_.shape == (len(one), 3, 32, 32, 32)
+    np.testing.assert_array_equal(blind[:, :1], one)
+    np.testing.assert_array_equal(all_[:, :1], one)
+    assert (blind[:, 2] == UNKNOWN).all()
+    np.testing.assert_array_equal(blind[:, 1], all_[:, 2])
+    assert (all_[:, 1:] > UNKNOWN).all()
+    # the middle of the surroundings is the window itself, coarser: where it is empty, so is the middle
+    middle = coarse_channel(all_[:, 2])[:, 6:10, 6:10, 6:10]
+    blocks = one[:, 0, 4:28, 4:28, 4:28].reshape(-1, 4, 6, 4, 6, 4, 6).mean(axis=(2, 4, 6))
+    assert np.corrcoef(middle.ravel(), blocks.ravel())[0, 1] > 0.95
+
+
+def build(kit, aabb, names, cameras=None, **options):
+    denoiser = kit.torch_denoiser(keep_first, channels=names)
+    settings = {"cubes": 5, "field_pitch": PITCH, "visibility_weight": 0.0, "seed": 3} | options
+    return DensityRegularizer(denoiser, aabb=aabb, cameras=cameras, **settings), denoiser
+
+
+def test_the_regularizer_tells_all_it_knows(kit, aabb, crowd):
+    regularizer, denoiser = build(kit, aabb, CHANNEL_NAMES, crowd)
+    regularizer.observe(unit_lattice(8) * 1.9, np.ones((8, 8, 8)))
+    cubes = draw_cubes(
+        regularizer.grid, regularizer._rng(0), regularizer.settings, field_pitch=PITCH, resolution=32,
+        device=torch.device("cpu"),
+    )  # fmt: skip
+    regularizer(waves_of_tensors)
+    given = denoiser.calls[0][0]
+    assert given.shape == (5, 3, 32, 32, 32)
+    upright = np.broadcast_to(np.eye(3), (5, 3, 3))
+    np.testing.assert_array_equal(
+        given[:, 2], encode_view_count(count_views(crowd, cubes.centers, cubes.edges, upright))
+    )
+    expected = surroundings(lambda p: waves(p), cubes.centers, cubes.edges, upright, np.full(5, PITCH), aabb)
+    np.testing.assert_allclose(coarse_channel(given[:, 1]), encode_surroundings(expected), atol=1e-5)
+    assert expected.std() > 0.1
+
+
+def test_without_cameras_views_are_unknown_and_surroundings_follow_the_rule(kit, aabb):
+    regularizer, denoiser = build(kit, aabb, CHANNEL_NAMES, soft=False)
+    regularizer(waves_of_tensors)
+    given = denoiser.calls[0][0]
+    assert (given[:, 2] == UNKNOWN).all()
+    eighths = (given[:, 1] + 0.5) / 1.5 * 8  # means of eight bits
+    np.testing.assert_allclose(eighths, np.round(eighths), atol=1e-4)
+
+
+def test_no_gradient_flows_through_what_is_told(kit, aabb, crowd):
+    class Watched(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.level = torch.nn.Parameter(torch.tensor(1.0))
+            self.asked = {True: 0, False: 0}
+
+        def forward(self, positions):
+            self.asked[torch.is_grad_enabled()] += len(positions)
+            return waves_of_tensors(positions) * self.level
+
+    gradients, asked = [], []
+    for names in (CHANNEL_NAMES[:1], CHANNEL_NAMES):
+        field = Watched()
+        regularizer, _ = build(kit, aabb, names, crowd)
+        regularizer.observe(unit_lattice(8) * 1.9, np.ones((8, 8, 8)))
+        regularizer(field)["dsds"].backward()
+        gradients.append(field.level.grad.item())
+        asked.append(field.asked)
+    assert gradients[0] == gradients[1] != 0
+    assert asked[0][True] == asked[1][True]
+    assert asked[0][False] == 0 < asked[1][False] <= 5 * 32**3
+
+
+def test_distorted_cameras_do_for_both(kit, aabb, crowd):
+    bend = np.broadcast_to(np.array([0.05, -0.05, 0, 0, 0, 0]), (9, 6))
+    bent = Cameras(crowd.camera_to_world, crowd.intrinsics, 40, 30, bend)
+    regularizer, denoiser = build(kit, aabb, CHANNEL_NAMES, bent)
+    regularizer(waves_of_tensors)
+    assert len(np.unique(denoiser.calls[0][0][:, 2])) > 2
