@@ -26,6 +26,8 @@ def lively_network(config: NetworkConfig, seed: int = 0) -> RestorationNet:
         for block in network.blocks:
             block.second.weight.mul_(10.0)
         network.head.weight.mul_(30.0)
+        if config.surroundings is not None:
+            network.context.project.weight.mul_(10.0)
         network.gain.fill_(0.7)
     return network
 

@@ -3,9 +3,12 @@ import dataclasses
 import numpy as np
 import pytest
 
+from unghost.bench import measure_speed
+from unghost.core.channels import CHANNEL_NAMES, LEAST_KNOWN, UNKNOWN, coarse_channel, full_channel
 from unghost.core.manifest import Manifest
 from unghost.export.parity import compare, parity_inputs, verify
 from unghost.export.runtime import OnnxDenoiser
+from unghost.export.to_onnx import export_onnx
 from unghost.prior.checkpoint import load_model, save_model
 from unghost.prior.network import NetworkConfig
 
@@ -25,6 +28,32 @@ def test_input_i_depends_on_seed_and_i_alone():
     few, many = parity_inputs(5, 7), parity_inputs(9, 7)
     for name in ("channels", "timestep", "edge_fraction"):
         assert np.array_equal(getattr(few, name), getattr(many, name)[:5])
+
+
+def test_inputs_of_more_channels():
+    """The first is what it is alone; the others hold values of theirs, or are unknown throughout."""
+    one, names = parity_inputs(32, 7), ("signed_opacity", "view_count", "surroundings")
+    inputs = parity_inputs(32, 7, channels=names)
+    assert np.array_equal(inputs.channels[:, :1], one.channels)
+    assert np.array_equal(inputs.edge_fraction, one.edge_fraction)
+    for channel in (1, 2):
+        unknown = (inputs.channels[:, channel] == UNKNOWN).all(axis=(1, 2, 3))
+        assert unknown.sum() == 8
+        assert inputs.channels[~unknown, channel].min() >= LEAST_KNOWN
+        assert inputs.channels[~unknown, channel].max() > 0.8
+    about = inputs.channels[:, 2]
+    assert np.array_equal(full_channel(coarse_channel(about)), about)
+
+
+def test_a_model_of_all_channels_passes_and_is_timed(make_lively, tmp_path):
+    network = make_lively(NetworkConfig(channels=CHANNEL_NAMES, widths=(8, 16, 8), condition_width=8))
+    save_model(tmp_path / "all.safetensors", network, Manifest(name="all", channels=CHANNEL_NAMES))
+    manifest = export_onnx(tmp_path / "all.safetensors", tmp_path / "all.onnx")
+    assert manifest.channels == CHANNEL_NAMES
+    report = verify(tmp_path / "all.onnx", tmp_path / "all.safetensors", cubes=32)
+    assert report["passed"], report
+    speed = measure_speed(OnnxDenoiser(tmp_path / "all.onnx", threads=1), batch=2, seconds=1e-3)
+    assert speed["cubes_per_second"] > 0
 
 
 def test_default_architecture_passes(exported):

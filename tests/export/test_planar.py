@@ -4,7 +4,7 @@ import onnxruntime
 import pytest
 import torch
 
-from unghost.core.channels import CHANNEL_NAMES
+from unghost.core.channels import CHANNEL_NAMES, LEAST_KNOWN
 from unghost.export.graph import OPERATORS, OPSET
 from unghost.export.planar import planar_model
 from unghost.prior.network import SIZES, NetworkConfig
@@ -56,8 +56,27 @@ def test_borders_are_padded_alike(corner, make_lively):
     np.testing.assert_allclose(run(planar_model(network), *inputs), expected, rtol=0, atol=1e-5)
 
 
-def test_graph_is_valid_plain_and_dynamic(make_lively):
-    model = planar_model(make_lively(SIZES["m"]))
+@pytest.mark.parametrize("corner", [(0, 0, 0), (31, 31, 31), (0, 31, 0), (11, 13, 20), (10, 10, 21)])
+def test_borders_of_the_surroundings_are_padded_alike(corner, make_lively):
+    """One opaque voxel of the surroundings, at their border or at that of the part about the cube."""
+    network = make_lively(CONFIGS["all channels"])
+    with torch.no_grad():  # the far border matters through the summary alone
+        network.context.down.weight.mul_(30.0)
+        network.condition[0].weight[:, 18:].mul_(30.0)
+    cubes = np.full((1, 3, 32, 32, 32), LEAST_KNOWN, np.float32)
+    cubes[:, 0] = -1.0
+    dark = (cubes.copy(), np.array([500]), np.array([0.1], np.float32))
+    cubes[(0, 1, *(place // 2 * 2 for place in corner))] = 1.0
+    inputs = (cubes, *dark[1:])
+    with torch.no_grad():
+        expected, without = (network(*(torch.from_numpy(value) for value in given)).numpy() for given in (inputs, dark))
+    assert np.abs(expected - without).max() > 1e-4
+    np.testing.assert_allclose(run(planar_model(network), *inputs), expected, rtol=0, atol=5e-6)
+
+
+@pytest.mark.parametrize("name", ["default", "all channels"])
+def test_graph_is_valid_plain_and_dynamic(name, make_lively):
+    model = planar_model(make_lively(CONFIGS[name]))
     onnx.checker.check_model(model, full_check=True)
     assert {node.op_type for node in model.graph.node} <= OPERATORS
     assert [(item.domain, item.version) for item in model.opset_import] == [("", OPSET)]
@@ -77,8 +96,9 @@ def test_a_sample_of_a_batch_equals_the_sample_alone(make_lively):
         np.testing.assert_allclose(run(model, cubes[part], times[part], edges[part]), together[part], atol=1e-6)
 
 
-def test_only_2d_convolutions(make_lively):
-    model = planar_model(make_lively(CONFIGS["tiny"]))
+@pytest.mark.parametrize("name", ["tiny", "all channels"])
+def test_only_2d_convolutions(name, make_lively):
+    model = planar_model(make_lively(CONFIGS[name]))
     shapes = {item.name: item.dims for item in model.graph.initializer}
     kernels = [len(shapes[node.input[1]]) for node in model.graph.node if node.op_type.startswith("Conv")]
     assert kernels

@@ -3,8 +3,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from unghost.core.channels import CHANNEL_NAMES, UNKNOWN
 from unghost.core.manifest import Manifest
 from unghost.core.shards import dequantize_signed, pack_labels, quantize_signed, read_shard, write_shard
+from unghost.prior.batches import stored_channels
 from unghost.prior.evaluate import KeepCurve, evaluate, masked_iou
 
 
@@ -125,3 +127,21 @@ def test_inputs_reach_the_denoiser_as_stored(shard_paths):
     shard, seen = read_shard(shard_paths["held_out"]), []
     evaluate(Rule(lambda c: seen.append(c.copy()) or c), shard)
     assert np.array_equal(np.concatenate(seen)[:, 0], dequantize_signed(np.asarray(shard.inputs)))
+
+
+def test_a_denoiser_gets_the_channels_it_names(shard_paths):
+    """A ghost is what no view sees: with the views known, the rule is followed; without, all is unseen."""
+    shard, seen = read_shard(shard_paths["seen"]), []
+
+    def rule(channels):
+        seen.append(channels.copy())
+        return np.where(channels[:, 1:2] > -0.4, channels[:, :1], -1.0).astype(np.float32)
+
+    denoiser = Rule(rule)
+    names = ("signed_opacity", "view_count", "surroundings")
+    denoiser.manifest = Manifest(name="rule", channels=names)
+    told, blind = evaluate(denoiser, shard), evaluate(denoiser, shard, without=CHANNEL_NAMES[1:])
+    np.testing.assert_array_equal(seen[0], stored_channels(shard, np.arange(9), names))
+    assert (seen[1][:, 1:] == UNKNOWN).all()
+    assert blind["surface_kept_zero"] == 0.0 < told["surface_kept_zero"] < 1.0
+    assert told["iou_before"] == blind["iou_before"]
