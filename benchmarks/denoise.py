@@ -25,12 +25,13 @@ from denoise_scores import score
 from denoise_sets import MIXED, SEED, SEVERITIES, CubeSet, capture_set, harvest_set, mesh_sets
 from fit_cache import file_hash, say
 from numpy.typing import NDArray
-from unghost.core.channels import channels_of_cubes
 
 from unghost import load_denoiser
 from unghost.bench import measure_speed
 from unghost.core.arrays import to_numpy
+from unghost.core.channels import encode_known, stack_channels
 from unghost.core.results import build_results, write_results
+from unghost.core.shards import dequantize_share, dequantize_signed
 
 ROOT = Path(__file__).resolve().parents[1]
 TIMESTEPS = (100, 300, 500, 700, 999)
@@ -86,11 +87,13 @@ class Options:
 
 def predict(denoiser: Any, cubes: CubeSet, rows: NDArray[np.int64], timestep: int) -> NDArray[np.float32]:
     """``x0_pred (n, 32, 32, 32)`` for some cubes of a set."""
-    channels = channels_of_cubes(
-        denoiser.manifest.channels, cubes.signed[rows],
-        surroundings=None if cubes.surroundings is None else cubes.surroundings[rows],
-        view_count=None if cubes.view_count is None else cubes.view_count[rows],
-    )  # fmt: skip
+    about, views, light = cubes.surroundings, cubes.view_count, cubes.transmittance
+    known = encode_known(
+        surroundings=None if about is None else dequantize_signed(about[rows]),
+        view_count=None if views is None else views[rows],
+        transmittance=None if light is None else dequantize_share(light[rows]),
+    )
+    channels = stack_channels(denoiser.manifest.channels, cubes.signed[rows], known)
     edge = cubes.edge_fraction[rows]
     if denoiser.kind == "torch":
         import torch

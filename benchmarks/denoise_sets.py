@@ -39,6 +39,7 @@ class CubeSet:
         group: ``(N,)`` int32, mesh or scene.
         surroundings: ``(N, 16, 16, 16)`` uint8, or None.
         view_count: ``(N, 32, 32, 32)`` uint8, or None.
+        transmittance: ``(N, 16, 16, 16)`` uint8, or None.
     """
 
     name: str
@@ -49,6 +50,7 @@ class CubeSet:
     group: NDArray[np.int32]
     surroundings: NDArray[np.uint8] | None = None
     view_count: NDArray[np.uint8] | None = None
+    transmittance: NDArray[np.uint8] | None = None
 
     def __len__(self) -> int:
         return len(self.signed)
@@ -78,7 +80,7 @@ def from_shards(name: str, shards: list[Shard], count: int, **about: Any) -> Cub
     }
     for key in ("edge_fraction", "group"):
         arrays[key] = np.concatenate([getattr(shard, key)[rows] for shard, _, rows in parts])
-    for key in ("surroundings", "view_count"):
+    for key in ("surroundings", "view_count", "transmittance"):
         if all(getattr(shard, key) is not None for shard in shards):
             arrays[key] = np.concatenate([getattr(shard, key)[rows] for shard, _, rows in parts])
     return CubeSet(name, about, **arrays)

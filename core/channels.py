@@ -3,10 +3,11 @@
     signed_opacity   (32^3)  the cube itself: -1 is empty, +1 is opaque; always known, always first
     surroundings     (16^3)  signed opacity about the same centre at three times the edge: its mean over each voxel
     view_count       (32^3)  how many training views have a voxel in their frustum
+    transmittance    (16^3)  the largest share of light that one of them gets from there, through the field itself
 
 Optional channels (all but the first) hold known values in [-1/2, 1]; -1, which no known value comes near, says that
 the caller could not tell. Every channel has the cube's shape, so that ``channels (N, C, 32, 32, 32)`` is one array:
-each voxel of the surroundings is repeated 2 x 2 x 2 times, which :func:`coarse_channel` undoes exactly.
+each voxel of 16^3 is repeated 2 x 2 x 2 times, which :func:`coarse_channel` undoes exactly.
 
 Along an axis, in edges of the cube. A voxel of the surroundings is six of the cube's wide, and 5 1/3 of them cover
 the cube: the two grids do not line up, hence :func:`coincident_weights`.
@@ -31,7 +32,9 @@ from .shards import MAX_VIEW_COUNT, SURROUNDINGS_EDGE, SURROUNDINGS_RESOLUTION
 Float32 = NDArray[np.float32]
 
 SIGNED_OPACITY, SURROUNDINGS, VIEW_COUNT = "signed_opacity", "surroundings", "view_count"
-CHANNEL_NAMES = (SIGNED_OPACITY, SURROUNDINGS, VIEW_COUNT)
+TRANSMITTANCE = "transmittance"
+CHANNEL_NAMES = (SIGNED_OPACITY, SURROUNDINGS, VIEW_COUNT, TRANSMITTANCE)
+OPTIONAL_CHANNELS = CHANNEL_NAMES[1:]
 UNKNOWN = -1.0
 LEAST_KNOWN = -0.5  # of an optional channel: an empty voxel, no view
 POOLED = 2  # points along an axis of each voxel of the surroundings
@@ -72,8 +75,14 @@ def encode_view_count(counts: NDArray[np.integer]) -> Float32:
     return encoded
 
 
+def encode_transmittance(share: NDArray[np.floating]) -> Float32:
+    """Shares of light ``(...)`` in [0, 1] to the channel's values in [-1/2, 1]."""
+    encoded: Float32 = np.float32(LEAST_KNOWN) + np.float32(1.0 - LEAST_KNOWN) * np.asarray(share, dtype=np.float32)
+    return encoded
+
+
 def full_channel(coarse: NDArray[np.floating]) -> Float32:
-    """Surroundings ``(..., 16, 16, 16)`` as a channel ``(..., 32, 32, 32)``: each voxel 2 x 2 x 2 times."""
+    """Surroundings or transmittances ``(..., 16, 16, 16)`` as a channel ``(..., 32, 32, 32)``: each 2 x 2 x 2 times."""
     grown = np.asarray(coarse, dtype=np.float32)
     for axis in (-3, -2, -1):
         grown = np.repeat(grown, REPEAT, axis=axis)
@@ -86,13 +95,36 @@ def coarse_channel(channel: NDArray[np.floating]) -> Float32:
     return taken
 
 
+def encode_known(
+    *,
+    surroundings: NDArray[np.floating] | None = None,
+    view_count: NDArray[np.integer] | None = None,
+    transmittance: NDArray[np.floating] | None = None,
+) -> dict[str, Float32]:
+    """The optional channels that are known, encoded, by name.
+
+    Args:
+        surroundings: ``(N, 16, 16, 16)`` mean signed opacity.
+        view_count: ``(N, 32, 32, 32)``.
+        transmittance: ``(N, 16, 16, 16)`` shares of light.
+    """
+    known: dict[str, Float32] = {}
+    if surroundings is not None:
+        known[SURROUNDINGS] = encode_surroundings(surroundings)
+    if view_count is not None:
+        known[VIEW_COUNT] = encode_view_count(view_count)
+    if transmittance is not None:
+        known[TRANSMITTANCE] = encode_transmittance(transmittance)
+    return known
+
+
 def stack_channels(names: Sequence[str], signed: NDArray[np.floating], known: Mapping[str, Float32]) -> Float32:
     """Put the channels that a denoiser asks for together; those that are not known say so.
 
     Args:
         names: of the channels, in order.
         signed: ``(N, R, R, R)`` signed opacity.
-        known: name to encoded values ``(N, R, R, R)``, or ``(N, 16, 16, 16)`` for the surroundings; others are ignored.
+        known: name to encoded values ``(N, R, R, R)``, or ``(N, 16, 16, 16)``; others are ignored.
 
     Returns:
         ``(N, C, R, R, R)`` float32 in [-1, 1].

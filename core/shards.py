@@ -79,6 +79,18 @@ def dequantize_signed(stored: NDArray[np.uint8]) -> NDArray[np.float32]:
     return stored.astype(np.float32) / np.float32(127.5) - np.float32(1.0)
 
 
+def quantize_share(share: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """[0, 1] to uint8; values beyond are clipped."""
+    levels: NDArray[np.uint8] = np.rint(np.clip(share, 0.0, 1.0) * 255.0).astype(np.uint8)
+    return levels
+
+
+def dequantize_share(stored: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Inverse of :func:`quantize_share`, to float32 in [0, 1]."""
+    share: NDArray[np.float32] = np.asarray(stored, dtype=np.float32) / np.float32(255.0)
+    return share
+
+
 def _sha256(path: Path) -> str:
     digest = hashlib.sha256()
     with path.open("rb") as stream:

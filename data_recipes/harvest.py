@@ -26,6 +26,7 @@ from ..core.shards import (
     TRANSMITTANCE_RESOLUTION,
     dequantize_signed,
     pack_labels,
+    quantize_share,
     quantize_signed,
     read_shard,
     unpack_labels,
@@ -103,7 +104,7 @@ def harvest_cubes(
             "severity": severity_of(inputs, labels),
             "surroundings": quantize_signed(about),
             "view_count": count_views(truth.cameras, *frames),
-            "transmittance": np.rint(255 * maps.best_view(coarse)).astype(np.uint8),
+            "transmittance": quantize_share(maps.best_view(coarse)),
         })  # fmt: skip
     arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     arrays["edge_fraction"] = (edges / scene_extent(field.aabb)).astype(np.float32)

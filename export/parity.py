@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.channels import (
+    OPTIONAL_CHANNELS,
     SIGNED_OPACITY,
-    SURROUNDINGS,
     VIEW_COUNT,
     coarse_channel,
     encode_surroundings,
@@ -63,7 +63,7 @@ def _opacity(rng: np.random.Generator, kind: int) -> NDArray[Any]:
 
 
 def _beside(rng: np.random.Generator, name: str, kind: int) -> NDArray[np.float32]:
-    """One optional channel of a cube, ``(R, R, R)`` or coarser: views that grow from corner to corner, or opacity."""
+    """One optional channel of a cube, ``(R, R, R)`` or coarser: views that grow from corner to corner, or shares."""
     if name == VIEW_COUNT:
         return encode_view_count(np.maximum(unit_lattice() @ rng.normal(0, 60, 3) + rng.uniform(0, 60), 0).astype(int))
     return encode_surroundings(coarse_channel(signed_from_opacity(_opacity(rng, kind))))
@@ -85,7 +85,7 @@ def parity_inputs(cubes: int, seed: int, *, channels: Sequence[str] = (SIGNED_OP
         edges[index] = (0.05, 1e-6, 10.0, math.exp(rng.uniform(math.log(0.01), 0.0)))[index // 24 % 4]
         known = {
             name: _beside(rng, name, (index + 1) % 8)[None]
-            for place, name in enumerate((SURROUNDINGS, VIEW_COUNT))
+            for place, name in enumerate(OPTIONAL_CHANNELS)
             if name in channels and (index + 2 * place) % 4 != 3
         }
         values[index] = stack_channels(channels, signed[None], known)[0]

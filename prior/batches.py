@@ -19,16 +19,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.channels import (
+    OPTIONAL_CHANNELS,
     SIGNED_OPACITY,
     SURROUNDINGS,
+    TRANSMITTANCE,
     VIEW_COUNT,
     check_channels,
-    encode_surroundings,
-    encode_view_count,
+    encode_known,
     stack_channels,
 )
 from ..core.schedule import timestep_from_severity
-from ..core.shards import Shard, dequantize_signed, read_shard, unpack_labels
+from ..core.shards import Shard, dequantize_share, dequantize_signed, read_shard, unpack_labels
 
 SYMMETRIES: tuple[tuple[tuple[int, ...], tuple[int, ...]], ...] = tuple(
     (permutation, tuple(axis for axis in range(3) if flips >> axis & 1))
@@ -104,11 +105,16 @@ def stored_channels(
         signed = dequantize_signed(stored[index])
         return signed if depth == 1.0 else scale_depth(signed, depth)
 
-    wanted, known = set(names) - set(without), {}
-    if SURROUNDINGS in wanted and shard.surroundings is not None:
-        known[SURROUNDINGS] = encode_surroundings(opacity(shard.surroundings))
-    if VIEW_COUNT in wanted and shard.view_count is not None:
-        known[VIEW_COUNT] = encode_view_count(shard.view_count[index])
+    def told(name: str) -> Any:
+        stored = getattr(shard, name)
+        return None if stored is None or name not in names or name in without else stored
+
+    about, views, light = told(SURROUNDINGS), told(VIEW_COUNT), told(TRANSMITTANCE)
+    known = encode_known(
+        surroundings=None if about is None else opacity(about),
+        view_count=None if views is None else views[index],
+        transmittance=None if light is None else dequantize_share(light[index]) ** np.float32(depth),
+    )
     return stack_channels(names, opacity(shard.inputs), known)
 
 
@@ -162,7 +168,8 @@ class Mixture:
         shard = self.shards[min(choice, len(self.shards) - 1)]
         cube, symmetry, position = int(rng.integers(len(shard))), int(rng.integers(len(SYMMETRIES))), rng.random()
         depth = float(np.exp(rng.uniform(-DEPTH_JITTER, DEPTH_JITTER)))
-        chance = dict(zip((SURROUNDINGS, VIEW_COUNT), rng.random(2)))  # by name: the order of channels is the caller's
+        chances = rng.random(len(OPTIONAL_CHANNELS))  # by name: the order of channels is the caller's
+        chance = dict(zip(OPTIONAL_CHANNELS, chances))
         dropped = frozenset(name for name, value in chance.items() if value < self.drop_channels)
         return _Draw(shard, cube, symmetry, float(position), depth if _harvested(shard) else 1.0, dropped)
 

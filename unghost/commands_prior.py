@@ -207,7 +207,8 @@ def train(
         threads: of torch; 0 leaves it alone.
         threshold_from: validation names (commas between) whose thresholds, averaged, become the model's.
         init_from: a model.safetensors to start from.
-        channels: what the network sees: signed_opacity, surroundings, view_count; the first alone if not given.
+        channels: what the network sees: signed_opacity, surroundings, view_count, transmittance; the first alone if
+            not given.
         size: of the network: xs, s, m or l.
         drop_channels: share of the cubes of which an optional channel is made unknown.
         online: RECIPE=SHARE, a recipe whose pairs are made while the network trains and fill that share of every

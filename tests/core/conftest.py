@@ -23,6 +23,7 @@ def _optional():
     return {
         "surroundings": (np.arange(2 * 16**3) * 5 % 256).astype(np.uint8).reshape(2, 16, 16, 16),
         "view_count": (np.arange(2 * 32**3) * 3 % 256).astype(np.uint8).reshape(2, 32, 32, 32),
+        "transmittance": (np.arange(2 * 16**3) * 7 % 256).astype(np.uint8).reshape(2, 16, 16, 16),
         "frames": np.stack([pack_frame(turned), pack_frame(None)]),
         "source": np.array([0, -1], dtype=np.int32),
     }

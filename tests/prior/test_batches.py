@@ -3,7 +3,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from unghost.core.channels import CHANNEL_NAMES, UNKNOWN, encode_surroundings, encode_view_count, full_channel
+from unghost.core.channels import (
+    CHANNEL_NAMES,
+    UNKNOWN,
+    encode_surroundings,
+    encode_transmittance,
+    encode_view_count,
+    full_channel,
+)
 from unghost.core.shards import dequantize_signed, read_shard, unpack_labels, write_shard
 from unghost.prior.batches import (
     BLIND_SEVERITY,
@@ -174,9 +181,11 @@ def test_all_channels_and_the_labels_move_together(shard_paths):
             scale_depth(dequantize_signed(shard.inputs[draw.cube]), draw.depth),
             full_channel(encode_surroundings(coarse)),
             encode_view_count(shard.view_count[draw.cube]),
+            full_channel(encode_transmittance((shard.transmittance[draw.cube] / np.float32(255)) ** draw.depth)),
         ]
+        assert len(expected) == len(CHANNEL_NAMES)
         for found, grid in zip(batch.channels[row], expected):
-            np.testing.assert_array_equal(found, apply_symmetry(grid, draw.symmetry))
+            np.testing.assert_allclose(found, apply_symmetry(grid, draw.symmetry), atol=1e-6)
         labels = unpack_labels(shard.labels[draw.cube : draw.cube + 1])[0]
         np.testing.assert_array_equal(batch.labels[row], apply_symmetry(labels, draw.symmetry))
     assert len(seen) > 15
@@ -216,7 +225,7 @@ def test_further_channels_change_no_other_draw(shard_paths):
 def test_stored_channels(shard_paths):
     shard, index = read_shard(shard_paths["seen"]), np.array([4, 0])
     found = stored_channels(shard, index, CHANNEL_NAMES)
-    assert found.shape == (2, 3, 32, 32, 32)
+    assert found.shape == (2, len(CHANNEL_NAMES), 32, 32, 32)
     np.testing.assert_array_equal(found[:, 2], encode_view_count(shard.view_count[index]))
     blind = stored_channels(shard, index, CHANNEL_NAMES, without=("view_count",))
     np.testing.assert_array_equal(blind[:, :2], found[:, :2])

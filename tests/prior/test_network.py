@@ -205,7 +205,7 @@ def test_further_channels_are_cheap():
 def test_inputs_unchanged_and_extra_channels_used():
     network, (cubes, times, edges) = (
         make_network(NetworkConfig(channels=CHANNEL_NAMES, widths=(8, 8, 8))),
-        make_inputs(1, 3),
+        make_inputs(1, len(CHANNEL_NAMES)),
     )
     kept = cubes.clone()
     with torch.no_grad():
