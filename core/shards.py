@@ -221,7 +221,7 @@ def write_shard(folder: str | Path, arrays: Mapping[str, NDArray[Any]], provenan
         shutil.rmtree(partial, ignore_errors=True)
         if isinstance(error, OSError):
             raise OSError(
-                error.errno, f"write_shard: cannot write {target} ({error}); nothing of it is left"
+                error.errno, f"write_shard: cannot write {target} ({error.strerror or error}); nothing of it is left"
             ) from error
         raise
 

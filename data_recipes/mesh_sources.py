@@ -6,9 +6,7 @@ order takes its samples, and it is reported.
 
 from __future__ import annotations
 
-import csv
 import hashlib
-import io
 import itertools
 import weakref
 from collections import OrderedDict
@@ -24,7 +22,7 @@ from ..core.frames import CubeFrame
 from ..core.shards import stays_within
 from .crops import sample_mesh_cubes
 from .guard import GuardLimits, MeshGuard
-from .meshes import MANIFEST, Mesh, MeshEntry, select_meshes
+from .meshes import MANIFEST, Mesh, MeshEntry, read_manifest, select_meshes
 from .recipe import Recipe
 from .repair import RepairOptions
 
@@ -57,7 +55,7 @@ class MeshLibrary:
         self.entries: list[MeshEntry] = select_meshes(recipe, mesh_root)
         content = (self.root / MANIFEST).read_bytes()
         self.manifest_sha256 = hashlib.sha256(content).hexdigest()
-        self._rows = list(csv.DictReader(io.StringIO(content.decode("utf-8"), newline="")))
+        self._rows = read_manifest(content, where=str(self.root / MANIFEST))
         self.sources: dict[int, dict[str, Any]] = {}
         self.rejected: dict[int, dict[str, Any]] = {}
         self._meshes: OrderedDict[int, Mesh] = OrderedDict()

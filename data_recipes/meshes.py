@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -85,6 +86,26 @@ class MeshEntry:
     path: Path
 
 
+def read_manifest(content: bytes, *, where: str) -> list[dict[str, str]]:
+    """The rows of a mesh manifest (CSV in UTF-8), each with a path, a split and a licence.
+
+    Raises:
+        ValueError: it is not that; the message names ``where``.
+    """
+    try:
+        reader = csv.DictReader(io.StringIO(content.decode("utf-8"), newline=""))
+        missing = [name for name in _MANIFEST_COLUMNS if name not in (reader.fieldnames or ())]
+        if missing:
+            raise ValueError(f"select_meshes: {where} lacks the columns {', '.join(missing)}")
+        rows = list(reader)
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise ValueError(f"select_meshes: {where} is not CSV in UTF-8 ({error})") from None
+    for number, row in enumerate(rows):
+        if None in row or None in [row[name] for name in _MANIFEST_COLUMNS]:
+            raise ValueError(f"select_meshes: row {number} of {where} has more or fewer columns than its head")
+    return rows
+
+
 def select_meshes(recipe: Recipe, mesh_root: str | Path) -> list[MeshEntry]:
     """The meshes of ``mesh_root/manifest.csv`` whose licence, split and format the recipe names, in its order.
 
@@ -94,13 +115,11 @@ def select_meshes(recipe: Recipe, mesh_root: str | Path) -> list[MeshEntry]:
     """
     manifest = Path(mesh_root) / MANIFEST
     if not manifest.is_file():
-        raise FileNotFoundError(f"select_meshes: {manifest} is not a file")
-    with manifest.open(encoding="utf-8", newline="") as stream:
-        reader = csv.DictReader(stream)
-        missing = [name for name in _MANIFEST_COLUMNS if name not in (reader.fieldnames or ())]
-        if missing:
-            raise ValueError(f"select_meshes: {manifest} lacks the columns {', '.join(missing)}")
-        rows = list(reader)
+        raise FileNotFoundError(
+            f"select_meshes: {manifest} is not a file: a folder of meshes needs one that lists them, with the columns "
+            f"{', '.join(_MANIFEST_COLUMNS)}"
+        )
+    rows = read_manifest(manifest.read_bytes(), where=str(manifest))
     entries = [
         MeshEntry(number, Path(mesh_root) / row["path"])
         for number, row in enumerate(rows)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -129,6 +130,12 @@ def sources_of(shard: Shard) -> Counter[tuple[str, str]]:
     return found
 
 
+def _rejected(shards: Sequence[Shard]) -> dict[str, str]:
+    """Path and reason of the meshes that were passed over for some shard."""
+    notes = [note for shard in shards for note in shard.provenance.get("rejected") or () if isinstance(note, dict)]
+    return {str(note.get("path", "unknown")): str(note.get("reason", "unknown")) for note in notes}
+
+
 def compare(found: CubeStatistics, other: CubeStatistics) -> dict[str, Any]:
     """Distance of two sets, ``distance``, its parts, ``features``, and what chance makes of it, ``floor``."""
     parts = feature_distances(found, other)
@@ -161,6 +168,7 @@ def write_preview(
 
     Raises:
         ValueError: no shard there, a shard that is not valid, or numbers out of range.
+        OSError: the page cannot be written; one that was there stays.
     """
     if cubes < 0 or measured < 1:
         raise ValueError(f"write_preview: cubes must be >= 0 and measured >= 1, got {cubes} and {measured}")
@@ -182,10 +190,15 @@ def write_preview(
         edges=np.concatenate([np.asarray(shard.edge_fraction, dtype=np.float64) for _, shard in shards]),
         severities=np.concatenate([np.asarray(shard.severity, dtype=np.float64) for _, shard in shards]),
         sources=sum((sources_of(shard) for _, shard in shards), Counter()),
+        rejected=_rejected([shard for _, shard in shards]),
     )
     target = root.resolve().with_name(f"{root.resolve().name}-preview.html") if out is None else Path(out)
     target.parent.mkdir(parents=True, exist_ok=True)
     partial = target.with_name(target.name + ".partial")
-    partial.write_text(text, encoding="utf-8")
-    os.replace(partial, target)
+    try:
+        partial.write_text(text, encoding="utf-8")
+        os.replace(partial, target)
+    except OSError:  # a full disk, say
+        partial.unlink(missing_ok=True)
+        raise
     return target, facts

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from .preview import DrawnCube
 
 Values = NDArray[np.float64]
-INK, SECOND = "#4a6079", "#d98a4a"
+INK, SECOND = "#4a6079", "#8fb39f"  # neither of them a colour of the cubes
 STYLE = """
 :root { color-scheme: light; --ink: #23252b; --soft: #666a73; --line: #e0dcd4; }
 * { box-sizing: border-box; }
@@ -206,6 +206,16 @@ def _against(facts: Mapping[str, Any]) -> str:
     )
 
 
+def _passed_over(rejected: Mapping[str, str], most: int = 20) -> str:
+    """The meshes of which nothing could be made, or nothing."""
+    if not rejected:
+        return ""
+    rows = sorted(rejected.items())
+    rest = f"<p class=soft>And {len(rows) - most} more.</p>" if len(rows) > most else ""
+    said = _table(["mesh that was passed over", "reason"], rows[:most], text_columns=(1,))
+    return f"<h2>Passed over</h2>{said}{rest}"
+
+
 def page_text(
     *,
     name: str,
@@ -215,6 +225,7 @@ def page_text(
     edges: Values,
     severities: Values,
     sources: Mapping[tuple[str, str], int],
+    rejected: Mapping[str, str],
 ) -> str:
     """The whole page; see :func:`unghost.data_recipes.preview.write_preview` for what it shows."""
     keys = (
@@ -248,8 +259,9 @@ second from the first.</p>
 <p class="soft">Statistics are of {facts["cubes"]} cubes drawn at random.</p>
 <h2>{len(drawn)} of the cubes, drawn at random</h2>
 <p class="key soft">{legend}</p>
-<p class="soft">Below each pair: the overlap of the two, how much of the input is ghost,
-how much of the truth is missing.</p>
+<p class="soft">Below each pair: the overlap of the two, how much of the input is ghost, how much of the truth is
+missing; then where the pair is stored, the cube's edge as a share of its scene's or object's extent, and how severe
+the damage is said to be, from 0 (none) to 1.</p>
 <div class="cubes">{"".join(_card(cube) for cube in drawn)}</div>
 <h2>Distributions</h2>
 <div class="charts">{_charts(statistics, edges, severities)}</div>
@@ -258,5 +270,6 @@ how much of the truth is missing.</p>
 {_against(facts)}
 <h2>Sources and licences</h2>
 {_table(["source", "licence", "cubes"], origins, text_columns=(1,))}
+{_passed_over(rejected)}
 </main></body></html>
 """

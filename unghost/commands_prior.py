@@ -17,17 +17,19 @@ def curate(
     workers: int = 1, mesh_root: Path | None = None, engine: Literal["local", "ray"] = "local",
     shard_length: int = 8192,
 ) -> None:  # fmt: skip
-    """Make training pairs from a recipe: procedural cubes or meshes, and their corruptions.
+    """Make training pairs from a recipe: cubes of procedural solids, booleans or meshes, and their corruptions.
 
     Args:
-        recipe: a built-in name (procedural, meshes) or a .toml file.
-        out: folder for the shards; a killed run continues there.
+        recipe: procedural, csg or meshes, which are built in, or a .toml file.
+        out: folder for the shards, for one run at a time. The same call goes on there after a kill, which costs the
+            shard that was being made and changes no byte.
         count: pairs.
         seed: pair i depends on (seed, i) alone.
         workers: processes; the bytes do not depend on it.
-        mesh_root: folder with the meshes and their manifest.csv, for recipes that read meshes.
+        mesh_root: folder with the meshes and their manifest.csv (path, split, licence), for recipes that read meshes.
+            A mesh that cannot be used is passed over and named at the end.
         engine: where the workers run; ray uses the cluster of RAY_ADDRESS, or else starts one on this machine.
-        shard_length: pairs a shard.
+        shard_length: pairs a shard, 41 kB each on disk and in memory.
     """
     from .data_recipes.curate import curate as make
     from .data_recipes.recipe import load_recipe
@@ -48,11 +50,12 @@ def harvest(
     Every cube comes with its surroundings, its frame, and how many photos saw each voxel.
 
     Args:
-        out: folder for the shards, one a scene; a killed run continues there.
-        scenes: how many.
+        out: folder for the shards, one a scene, for one run at a time. The same call goes on there after a kill,
+            which costs the scenes that were under way, one a worker.
+        scenes: how many; each takes minutes of one core.
         seed: scene i depends on (seed, i) alone.
         first: number of the first scene.
-        workers: processes.
+        workers: processes, each at a scene of its own.
         fit: fit fields; without it, cubes are of perfect fields with synthetic corruption (quick).
         cubes: per scene (and snapshot of its field); the default of HarvestConfig if not given.
         kinds: of field, NAME or NAME=SHARE: dense, hash, mlp; dense and hash if not given. mlp is meant to be
@@ -89,7 +92,7 @@ def preview(
 
     Args:
         folder: a shard, or a folder of shards.
-        out: the page; FOLDER-preview.html beside the folder if not given.
+        out: the page, one HTML file with all its pictures; FOLDER-preview.html beside the folder if not given.
         cubes: how many to draw.
         seed: of the choice of cubes.
         against: another shard or folder; the page states how unlike the two are.

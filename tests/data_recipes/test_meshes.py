@@ -154,6 +154,22 @@ def test_bad_manifests(mesh_root, tmp_path_factory):
         select_meshes(RECIPE, mesh_root)
 
 
+@pytest.mark.parametrize(
+    ("content", "rule"),
+    [
+        (b"", "lacks the columns path, split, licence"),
+        (b"path,split,licence\na.ply,train\n", "row 0 of .* has more or fewer columns"),
+        (b"path,split,licence\na.ply,train,MIT-0\nb,c.ply,train,MIT-0\n", "row 1 of .* has more or fewer columns"),
+        (b"path,split,licence\n\xff.ply,train,MIT-0\n", "is not CSV in UTF-8"),
+        (b"path,split,licence\n" + b"a" * 200_000 + b".ply,train,MIT-0\n", "is not CSV in UTF-8"),
+    ],
+)
+def test_manifests_that_are_none_are_refused(mesh_root, content, rule):
+    (mesh_root / "manifest.csv").write_bytes(content)
+    with pytest.raises(ValueError, match=f"select_meshes: .*{rule}"):
+        select_meshes(RECIPE, mesh_root)
+
+
 def test_samples_share_meshes_in_runs_and_every_mesh_has_its_turn(mesh_root):
     recipe = dataclasses.replace(RECIPE, cubes_per_mesh=3)
     library = MeshLibrary(recipe, mesh_root)

@@ -1,3 +1,4 @@
+import pathlib
 import re
 import xml.dom.minidom
 from collections import Counter
@@ -122,6 +123,38 @@ def test_what_a_shard_says_of_itself_is_only_text(tmp_path):
     assert page.tags["script"] == 0
     assert "".join(page.said).count(evil) == 2
     assert "a<b>&c" in "".join(page.said)
+
+
+def test_meshes_that_were_passed_over_are_named(tmp_path):
+    signed, labels = slabs(1)
+    notes = [{"path": f"kit/{row:02}.glb", "reason": "rejected: <no GLB>", "row": row} for row in range(23)]
+    for name in ("a", "b"):
+        shard_of(tmp_path / "s" / name, signed, labels, {"rejected": notes})
+    page = Page(write_preview(tmp_path / "s", cubes=0)[0].read_text(encoding="utf-8"))
+    said = "".join(page.said)
+    assert said.count("rejected: <no GLB>") == 20
+    assert "kit/19.glb" in said
+    assert "kit/20.glb" not in said
+    assert "And 3 more." in said
+
+
+def test_a_full_disk_leaves_the_page_that_was_there(pairs, tmp_path, monkeypatch):
+    target = tmp_path / "page.html"
+    target.write_text("before", encoding="utf-8")
+    real = pathlib.Path.open
+
+    def full(self, *args, **kwargs):  # fails with ENOSPC on writing, as a full disk does
+        if self.suffix == ".partial":
+            self.touch()
+            return real(pathlib.Path("/dev/full"), *args, **kwargs)
+        return real(self, *args, **kwargs)
+
+    monkeypatch.setattr(pathlib.Path, "open", full)
+    with pytest.raises(OSError, match="No space left on device"):
+        write_preview(pairs, out=target, cubes=0)
+    monkeypatch.undo()
+    assert target.read_text(encoding="utf-8") == "before"
+    assert [path.name for path in tmp_path.iterdir()] == ["page.html"]
 
 
 def test_another_set_stands_beside(pairs, tmp_path):
