@@ -16,7 +16,8 @@ from ..core.cameras import Cameras
 from ..core.manifest import Denoiser
 from ..core.occupancy import EMPTY, OccupancyRule, check_density
 from ..core.schedule import check_timestep
-from .context import GridContext
+from ..core.transmittance import TransmittanceMaps
+from .context import GridContext, light_maps
 from .decide import decide, removed_regions
 from .denoise import check_denoiser
 from .keep_mask import KeepMask, lattice_origin
@@ -134,7 +135,8 @@ def clean(
             asked about one point with an array and, if that raises and torch is loaded, with a tensor.
         aabb: ``(2, 3)`` scene units: where to clean; the rest is left as it is.
         denoiser: kind ``"numpy"`` or ``"torch"``. One that asks for the surroundings gets them from the same grid.
-        cameras: of the training photos, for a denoiser that asks for view counts; without them those are unknown.
+        cameras: of the training photos, for a denoiser that asks who sees a cell (view counts, transmittances);
+            without them that is unknown.
         settings: see :class:`CleanSettings`; ``overrides`` replace single ones (``field_pitch`` foremost).
         progress: called with (windows done, windows in all), level by level.
 
@@ -158,7 +160,8 @@ def clean(
     pitch, shape = grid_of(box, s)
     query = make_query(density_fn, place=box.mean(axis=0), backend=s.backend, chunk=s.chunk, caller="clean")
     survey = _survey(query, box, pitch, shape, s)
-    score, windows = _score(survey, denoiser, s, box, pitch, cameras, progress)
+    maps = light_maps(denoiser.manifest.channels, cameras, query, aabb=box, pitch=s.field_pitch or pitch)
+    score, windows = _score(survey, denoiser, s, box, pitch, cameras, maps, progress)
     threshold = threshold_of(s.strength, denoiser.manifest.removal_threshold)
     removed, faint = decide(
         survey.occupied, survey.judged, score,
@@ -233,7 +236,7 @@ def _survey(
 
 def _score(
     survey: _Survey, denoiser: Denoiser, s: CleanSettings, aabb: NDArray[np.float64], pitch: float,
-    cameras: Cameras | None, progress: Progress | None,
+    cameras: Cameras | None, maps: TransmittanceMaps | None, progress: Progress | None,
 ) -> tuple[FloatGrid, int]:  # fmt: skip
     """Weighted mean of the levels' votes, and the windows it took."""
     origin, names = lattice_origin(aabb, pitch, survey.signed.shape), denoiser.manifest.channels
@@ -255,7 +258,7 @@ def _score(
             overlap=s.overlap,
             skip_empty=s.skip_empty,
             progress=progress,
-            context=GridContext(names, signed, origin=origin, pitch=factor * pitch, cameras=cameras),
+            context=GridContext(names, signed, origin=origin, pitch=factor * pitch, cameras=cameras, maps=maps),
         )
         total += np.float32(weight / sum(s.level_weights)) * grow(votes, factor, total.shape)
         windows += sent

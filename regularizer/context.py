@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.aabb import contains
 from ..core.cameras import Cameras
 from ..core.channels import (
     POOLED,
     SURROUNDINGS,
+    TRANSMITTANCE,
     VIEW_COUNT,
     encode_surroundings,
+    encode_transmittance,
     encode_view_count,
     pool_surroundings,
 )
 from ..core.cube_views import count_views, pinholes
-from ..core.frames import RESOLUTION
+from ..core.frames import RESOLUTION, cube_lattices
 from ..core.occupancy import EMPTY
-from ..core.shards import SURROUNDINGS_RESOLUTION
+from ..core.shards import SURROUNDINGS_RESOLUTION, TRANSMITTANCE_RESOLUTION
+from ..core.transmittance import DensityFn, TransmittanceMaps
 
 FloatGrid = NDArray[np.float32]
 Corner = tuple[int, ...]
@@ -42,6 +46,37 @@ def view_channel(cameras: Cameras, centers: NDArray[np.float64], edges: NDArray[
     return encode_view_count(count_views(cameras, centers, edges, upright))
 
 
+def light_maps(
+    names: Sequence[str], cameras: Cameras | None, density_fn: DensityFn, *, aabb: NDArray[np.float64], pitch: float
+) -> TransmittanceMaps | None:
+    """Rays from the cameras through the field in its box, or None if nobody asks or there are no cameras.
+
+    Args:
+        names: the denoiser's channels.
+        cameras: of the training photos.
+        density_fn: ``(M, 3)`` to ``(M,)``, asked inside the box alone; what is NaN, infinite or negative lets light by.
+        aabb: ``(2, 3)``.
+        pitch: side of the field's cells.
+    """
+    if cameras is None or len(cameras) == 0 or TRANSMITTANCE not in names:
+        return None
+
+    def inside(positions: NDArray[np.float32]) -> NDArray[np.float64]:
+        within = contains(aabb, positions)
+        values = np.asarray(density_fn(positions[within]), dtype=np.float64).reshape(-1)
+        density = np.zeros(len(positions))
+        density[within] = np.where(np.isfinite(values) & (values >= 0), values, 0.0)
+        return density
+
+    return TransmittanceMaps.build(inside, cameras, aabb=aabb, field_pitch=pitch)
+
+
+def light_channel(maps: TransmittanceMaps, centers: NDArray[np.float64], edges: NDArray[np.float64]) -> FloatGrid:
+    """The channel ``transmittance`` of axis-aligned cubes ``(N, 3)``, ``(N,)``: ``(N, 16, 16, 16)``."""
+    lattice = cube_lattices(centers, edges, None, resolution=TRANSMITTANCE_RESOLUTION)
+    return encode_transmittance(maps.best_view(lattice))
+
+
 class GridContext:
     """What a denoiser may be told about windows of a grid beyond their cells.
 
@@ -55,6 +90,7 @@ class GridContext:
         origin: ``(3,)`` corner of the grid, scene units.
         pitch: side of its cells.
         cameras: of the training photos; None for view counts that are unknown.
+        maps: of :func:`light_maps`; None for transmittances that are unknown.
     """
 
     def __init__(
@@ -65,10 +101,13 @@ class GridContext:
         origin: NDArray[np.float64],
         pitch: float,
         cameras: Cameras | None = None,
+        maps: TransmittanceMaps | None = None,
     ) -> None:
         self.names, self.signed, self.origin, self.pitch = tuple(names), signed, origin, pitch
         self.cameras = viewing_cameras(cameras, names)
+        self.maps = maps if TRANSMITTANCE in names else None
         self._tiles: dict[Corner, FloatGrid] = {}
+        self._light_tiles: dict[Corner, FloatGrid] = {}
 
     def known(self, corners: Sequence[Corner]) -> dict[str, FloatGrid]:
         """The channels that can be told, of windows whose first cells are ``corners`` (these may lie outside)."""
@@ -77,7 +116,9 @@ class GridContext:
             points = np.stack([self._about(corner) for corner in corners])
             told[SURROUNDINGS] = encode_surroundings(pool_surroundings(points))
         if self.cameras is not None:
-            told[VIEW_COUNT] = np.stack([self._views(corner) for corner in corners])
+            told[VIEW_COUNT] = np.stack([_cut(corner, RESOLUTION, self._views) for corner in corners])
+        if self.maps is not None:
+            told[TRANSMITTANCE] = np.stack([self._window_light(corner) for corner in corners])
         return told
 
     def _about(self, corner: Corner) -> FloatGrid:
@@ -91,22 +132,46 @@ class GridContext:
         within = x[:, None, None] & y[:, None] & z
         return np.where(within, self.signed[np.ix_(*taken)], np.float32(EMPTY)).astype(np.float32, copy=False)
 
-    def _views(self, corner: Corner) -> FloatGrid:
-        """The view counts of a window, cut out of up to eight tiles."""
-        first = [start // RESOLUTION for start in corner]
-        ends = [-(-(start + RESOLUTION) // RESOLUTION) for start in corner]
-        block = np.empty([RESOLUTION * (end - begin) for begin, end in zip(first, ends)], dtype=np.float32)
-        for tile in itertools.product(*(range(begin, end) for begin, end in zip(first, ends))):
-            place = tuple(slice((t - b) * RESOLUTION, (t - b + 1) * RESOLUTION) for t, b in zip(tile, first))
-            block[place] = self._tile(tile)
-        starts = [start - RESOLUTION * begin for start, begin in zip(corner, first)]
-        return block[tuple(slice(start, start + RESOLUTION) for start in starts)]
+    def _frame(self, corner: Corner) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Centre ``(1, 3)`` and edge ``(1,)`` of the 32 cells from ``corner`` on."""
+        return (self.origin + (np.array(corner) + RESOLUTION / 2) * self.pitch)[None], np.array(
+            [RESOLUTION * self.pitch]
+        )
 
-    def _tile(self, tile: Corner) -> FloatGrid:
+    def _views(self, tile: Corner) -> FloatGrid:
         """The view counts of cells ``32 tile`` to ``32 (tile + 1)``, counted when first needed."""
         if tile not in self._tiles:
             assert self.cameras is not None
-            edge = RESOLUTION * self.pitch
-            center = self.origin + (np.array(tile) + 0.5) * edge
-            self._tiles[tile] = view_channel(self.cameras, center[None], np.array([edge]))[0]
+            self._tiles[tile] = view_channel(self.cameras, *self._frame(_times(tile, RESOLUTION)))[0]
         return self._tiles[tile]
+
+    def _light(self, tile: Corner) -> FloatGrid:
+        """The transmittances of those cells, in blocks of two."""
+        if tile not in self._light_tiles:
+            assert self.maps is not None
+            self._light_tiles[tile] = light_channel(self.maps, *self._frame(_times(tile, RESOLUTION)))[0]
+        return self._light_tiles[tile]
+
+    def _window_light(self, corner: Corner) -> FloatGrid:
+        """The transmittances of a window; one that begins in the middle of a block is looked up by itself."""
+        assert self.maps is not None
+        blocks = RESOLUTION // TRANSMITTANCE_RESOLUTION
+        if any(start % blocks for start in corner):
+            return light_channel(self.maps, *self._frame(corner))[0]
+        return _cut(tuple(start // blocks for start in corner), TRANSMITTANCE_RESOLUTION, self._light)
+
+
+def _times(tile: Corner, side: int) -> Corner:
+    return tuple(side * place for place in tile)
+
+
+def _cut(corner: Corner, side: int, tiles: Callable[[Corner], FloatGrid]) -> FloatGrid:
+    """The ``side^3`` values from ``corner`` on, cut out of up to eight tiles of as many."""
+    first = [start // side for start in corner]
+    ends = [-(-(start + side) // side) for start in corner]
+    block = np.empty([side * (end - begin) for begin, end in zip(first, ends)], dtype=np.float32)
+    for tile in itertools.product(*(range(begin, end) for begin, end in zip(first, ends))):
+        place = tuple(slice((t - b) * side, (t - b + 1) * side) for t, b in zip(tile, first))
+        block[place] = tiles(tile)
+    starts = [start - side * begin for start, begin in zip(corner, first)]
+    return block[tuple(slice(start, start + side) for start in starts)]

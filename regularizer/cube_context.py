@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,9 +11,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..core.aabb import contains
+from ..core.arrays import to_numpy
 from ..core.cameras import Cameras
 from ..core.channels import (
     SURROUNDINGS,
+    TRANSMITTANCE,
     VIEW_COUNT,
     encode_surroundings,
     pool_surroundings,
@@ -20,7 +23,8 @@ from ..core.channels import (
     surroundings_lattice,
 )
 from ..core.occupancy import EMPTY, OccupancyRule
-from .context import view_channel
+from ..core.transmittance import TransmittanceMaps
+from .context import light_channel, light_maps, view_channel
 from .cubes import CubeBatch
 from .losses import widest
 
@@ -50,6 +54,34 @@ def cube_surroundings(
     return pool_surroundings(signed.cpu().numpy())
 
 
+class FollowedRays:
+    """Rays from the cameras through fields that change: followed anew every so many steps.
+
+    Args:
+        names: the denoiser's channels; if it does not ask for transmittances, nothing is ever followed.
+        cameras: of the training photos, or None.
+        aabb: ``(2, 3)``.
+        every: steps, >= 1.
+    """
+
+    def __init__(self, names: Sequence[str], cameras: Cameras | None, aabb: NDArray[np.float64], *, every: int) -> None:
+        self.names, self.cameras, self.aabb, self.every = names, cameras, aabb, every
+        self._maps: dict[int, tuple[int, TransmittanceMaps | None]] = {}
+
+    def through(self, ask: Ask, *, index: int, step: int, pitch: float, like: Tensor) -> TransmittanceMaps | None:
+        """The maps of field ``index``, at most ``every`` steps old; positions are asked for where ``like`` is."""
+        followed, maps = self._maps.get(index, (step - self.every, None))
+        if step - followed >= self.every:
+
+            @torch.no_grad()
+            def density_fn(positions: NDArray[Any]) -> NDArray[Any]:
+                return to_numpy(ask(torch.as_tensor(positions, dtype=torch.float32, device=like.device)))
+
+            maps = light_maps(self.names, self.cameras, density_fn, aabb=self.aabb, pitch=pitch)
+            self._maps[index] = step, maps
+        return maps
+
+
 def complete_channels(
     names: tuple[str, ...],
     signed: Tensor,
@@ -57,6 +89,7 @@ def complete_channels(
     asked: Tensor,
     *,
     viewing: Cameras | None,
+    maps: TransmittanceMaps | None,
     surroundings: Callable[[], NDArray[np.float32]],
 ) -> Tensor:
     """All channels of the cubes that are asked about; what cannot be told is unknown.
@@ -66,6 +99,7 @@ def complete_channels(
         signed: ``(n, 1, R, R, R)``, the first of them.
         cubes, asked: as :func:`cube_surroundings` has them.
         viewing: cameras to count, or None.
+        maps: rays through the field, or None.
         surroundings: called if the denoiser wants them.
 
     Returns:
@@ -74,6 +108,8 @@ def complete_channels(
     some, known = asked.cpu().numpy(), {}
     if viewing is not None:
         known[VIEW_COUNT] = view_channel(viewing, cubes.centers[some], cubes.edges[some])
+    if maps is not None:
+        known[TRANSMITTANCE] = light_channel(maps, cubes.centers[some], cubes.edges[some])
     if SURROUNDINGS in names:
         known[SURROUNDINGS] = encode_surroundings(surroundings())
     nothing = np.broadcast_to(np.float32(EMPTY), (len(signed), *signed.shape[2:]))

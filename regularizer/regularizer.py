@@ -23,7 +23,7 @@ from ..core.manifest import Denoiser
 from ..core.occupancy import DECISION, EMPTY, check_density, check_density_shape, opacity_from_density
 from ..core.schedule import check_timestep
 from .context import viewing_cameras
-from .cube_context import complete_channels, cube_surroundings
+from .cube_context import FollowedRays, complete_channels, cube_surroundings
 from .cubes import CubeBatch, FieldPitch, draw_cubes, wide_dtype
 from .denoise import check_denoiser, run_denoiser
 from .losses import dsds_loss, stable_mean, upcast, visibility_loss, widest
@@ -56,7 +56,7 @@ class DensityRegularizer:
     Args:
         denoiser: kind ``"numpy"`` or ``"torch"``. One that asks for the surroundings costs as many positions again.
         aabb: ``(2, 3)``, scene units: where to clean.
-        cameras: of the training photos; None for no visibility loss, and view counts unknown to a denoiser that asks.
+        cameras: of the training photos; None for no visibility loss; who sees a place is unknown then.
         field_pitch: side of the field's own cells in scene units, or a function of cube centres ``(N, 3)``
             that gives it as ``(N,)`` (a contracted field); None if unknown: then the cube's voxel.
         device: where positions are created; None for the device of the field's parameters, else the CPU.
@@ -105,6 +105,7 @@ class DensityRegularizer:
         self.grid = ImportanceGrid(self.aabb, resolution=s.grid_resolution, decay=s.grid_decay)
         self._views = ViewCounter(cameras, min_views=s.min_views) if cameras is not None and len(cameras) else None
         self._viewing = viewing_cameras(cameras, denoiser.manifest.channels)
+        self._rays = FollowedRays(denoiser.manifest.channels, cameras, self.aabb, every=s.light_steps)
         self.step = 0
         self.report: Counter[str] = Counter()
         self.totals: Counter[str] = Counter()
@@ -222,17 +223,17 @@ class DensityRegularizer:
             resolution=self.denoiser.manifest.resolution, device=device,
         )  # fmt: skip
         self.report.update(cubes=s.cubes, voxels=cubes.inside.numel(), outside=int((~cubes.inside).sum()))
-        losses = [self._dsds_of_field(field, cubes, main=index == 0) for index, field in enumerate(fields)]
+        losses = [self._dsds_of_field(field, cubes, index) for index, field in enumerate(fields)]
         return torch.stack(losses).sum() * s.dsds_weight
 
-    def _dsds_of_field(self, field: DensityFn, cubes: CubeBatch, *, main: bool) -> Tensor:
+    def _dsds_of_field(self, field: DensityFn, cubes: CubeBatch, index: int) -> Tensor:
         """Mean over the voxels in the box, unweighted."""
         values, valid = self._query(field, cubes.positions[cubes.inside])
         density = values.new_zeros(cubes.inside.shape).masked_scatter(cubes.inside, values)
         used = cubes.inside.clone().masked_scatter(cubes.inside, valid)
-        if main:
+        if index == 0:
             self._refresh(*cubes.thinned(density.detach(), used))
-        x0_pred = self._predict(density.detach(), cubes, field)
+        x0_pred = self._predict(density.detach(), cubes, field, index)
         depth = widest(density) * cubes.pitch if self.settings.rule.kind == "opacity" else density
         loss = dsds_loss(
             depth,
@@ -243,7 +244,7 @@ class DensityRegularizer:
         )
         return stable_mean(torch.where(used, loss, torch.zeros_like(loss)), count=int(used.sum()))
 
-    def _predict(self, density: Tensor, cubes: CubeBatch, field: DensityFn) -> Tensor:
+    def _predict(self, density: Tensor, cubes: CubeBatch, field: DensityFn, index: int) -> Tensor:
         """``x0_pred (N, R, R, R)`` float32; all empty for cubes that were not worth asking about."""
         s = self.settings
         wide = widest(density)
@@ -256,11 +257,14 @@ class DensityRegularizer:
             return x0_pred
         channels = s.rule.encode(wide[asked], cubes.pitch[asked], soft=s.soft).float()[:, None]
         if len(self.denoiser.manifest.channels) > 1:
+
+            def ask(places: Tensor) -> Tensor:
+                return self._query(field, places)[0]
+
             channels = complete_channels(
                 self.denoiser.manifest.channels, channels, cubes, asked, viewing=self._viewing,
-                surroundings=lambda: cube_surroundings(
-                    lambda places: self._query(field, places)[0], cubes, asked, aabb=self.aabb, rule=s.rule, soft=s.soft
-                ),
+                maps=self._rays.through(ask, index=index, step=self.step, pitch=self._nominal_pitch(), like=density),
+                surroundings=lambda: cube_surroundings(ask, cubes, asked, aabb=self.aabb, rule=s.rule, soft=s.soft),
             )  # fmt: skip
         t = s.timestep(self.step) if callable(s.timestep) else s.timestep
         t = self.denoiser.manifest.default_timestep if t is None else t

@@ -33,6 +33,8 @@ class RegularizerSettings:
         visibility_samples: points a step for the visibility loss.
         visibility_kind: ``"mixed"``, ``"rays"`` (the paper) or ``"uniform"`` points.
         visibility_reach: how many times the aabb those points may go out to, >= 1.
+        light_steps: for a denoiser that asks how well the photos see a place through the field: steps after which
+            the rays are followed anew.
         min_views: points seen by fewer cameras are penalised (1: the paper).
         rule: density to occupancy.
         soft: show the denoiser opacities rather than bits (opacity rule only).
@@ -55,6 +57,7 @@ class RegularizerSettings:
     visibility_samples: int = 32768
     visibility_kind: PointKind = "mixed"
     visibility_reach: float = 1.0
+    light_steps: int = 50
     min_views: int = 1
     rule: OccupancyRule = dataclasses.field(default_factory=OccupancyRule)
     soft: bool = True
@@ -69,6 +72,7 @@ class RegularizerSettings:
         rules: dict[str, tuple[bool, str]] = {
             "cubes": (self.cubes >= 0, ">= 0"),
             "visibility_samples": (self.visibility_samples >= 0, ">= 0"),
+            "light_steps": (self.light_steps >= 1, ">= 1"),
             "min_views": (self.min_views >= 1, ">= 1"),
             "chunk": (self.chunk >= 1, ">= 1"),
             "seed": (self.seed >= 0, ">= 0"),

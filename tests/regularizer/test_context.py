@@ -10,17 +10,20 @@ from unghost.core.channels import (
     UNKNOWN,
     coarse_channel,
     encode_surroundings,
+    encode_transmittance,
     encode_view_count,
 )
 from unghost.core.cube_views import count_views
-from unghost.core.frames import random_rotations, unit_lattice
+from unghost.core.frames import cube_lattices, random_rotations, unit_lattice
+from unghost.core.transmittance import FAN, STEPS
 from unghost.data_recipes.harvest_context import surroundings
 from unghost.regularizer.clean import clean
-from unghost.regularizer.context import GridContext, viewing_cameras
+from unghost.regularizer.context import GridContext, light_maps, viewing_cameras
 from unghost.regularizer.cubes import draw_cubes
 from unghost.regularizer.regularizer import DensityRegularizer
 
 PITCH = 0.05
+SWAPPED = ("signed_opacity", "view_count", "surroundings", "transmittance")
 
 
 def keep_first(channels):
@@ -80,6 +83,45 @@ def test_views_of_windows_are_those_of_cubes(crowd):
     assert len(context._tiles) < 8 * len(CORNERS)
 
 
+def test_light_of_windows_is_that_of_cubes(crowd, aabb):
+    """From tiles where blocks line up, and where they do not."""
+    names, signed, origin = CHANNEL_NAMES, np.full((40, 40, 40), -1, np.float32), np.array([-1.0, -0.9, -1.1])
+    maps = light_maps(names, crowd, waves, aabb=aabb, pitch=PITCH)
+    context = GridContext(names, signed, origin=origin, pitch=0.05, maps=maps)
+    found = context.known(CORNERS)["transmittance"]
+    centers, edges = windows(CORNERS, origin, 0.05)
+    lattice = cube_lattices(centers, edges, None, resolution=16)
+    np.testing.assert_allclose(found, encode_transmittance(maps.best_view(lattice)), atol=1e-6)
+    assert found.std() > 0.05
+    assert len(context._light_tiles) <= 3 * 8
+
+
+def test_light_is_followed_inside_the_box_and_bad_values_let_it_by(crowd, aabb):
+    asked = []
+
+    def broken(positions):
+        asked.append(positions)
+        return np.where(positions[:, 0] > 0, np.nan, -1.0)
+
+    maps = light_maps(CHANNEL_NAMES, crowd, broken, aabb=aabb, pitch=PITCH)
+    assert (maps.through == 1).all()
+    assert all(((a >= aabb[0]) & (a <= aabb[1])).all() for a in asked)
+    assert light_maps(CHANNEL_NAMES[:3], crowd, broken, aabb=aabb, pitch=PITCH) is None
+    assert light_maps(CHANNEL_NAMES, None, broken, aabb=aabb, pitch=PITCH) is None
+
+
+def test_rays_are_followed_anew_after_some_steps(kit, aabb, crowd):
+    regularizer, denoiser = build(kit, aabb, CHANNEL_NAMES, crowd, light_steps=3)
+    thinnest = []
+    for step in range(5):
+        regularizer(lambda positions, step=step: torch.full((len(positions),), 3.0 + 2.0 * step))
+        ((followed, maps),) = regularizer._rays._maps.values()
+        thinnest.append((followed, float(-np.log(maps.through.astype(float).min()))))
+    assert len(denoiser.calls) == 5
+    assert [followed for followed, _ in thinnest] == [0, 0, 0, 3, 3]
+    assert thinnest[3][1] == pytest.approx(3.0 * thinnest[0][1], rel=1e-3)  # of step 3: three times as dense
+
+
 def test_nobody_counts_for_a_denoiser_that_does_not_ask(crowd):
     assert viewing_cameras(crowd, ("signed_opacity", "surroundings")) is None
     assert viewing_cameras(None, CHANNEL_NAMES) is None
@@ -93,17 +135,21 @@ def test_nobody_counts_for_a_denoiser_that_does_not_ask(crowd):
 def test_cleaning_tells_all_it_knows(kit, aabb, crowd, kind):
     seen, told, alone = (
         getattr(kit, kind)(keep_first, channels=names)
-        for names in (CHANNEL_NAMES, ("signed_opacity", "view_count", "surroundings"), CHANNEL_NAMES[:1])
+        for names in (
+            CHANNEL_NAMES,
+            ("signed_opacity", "view_count", "surroundings", "transmittance"),
+            CHANNEL_NAMES[:1],
+        )
     )
     options = {"field_pitch": PITCH, "level_weights": (1.0,)}
     clean(waves, aabb, denoiser=seen, **options)
     clean(waves, aabb, denoiser=told, cameras=crowd, **options)
     clean(waves, aabb, denoiser=alone, cameras=crowd, **options)
     blind, all_, one = (np.concatenate([call[0] for call in d.calls]) for d in (seen, told, alone))
-    assert blind.shape == all_.shape == (len(one), 3, 32, 32, 32)
+    assert blind.shape == all_.shape == (len(one), len(CHANNEL_NAMES), 32, 32, 32)
     np.testing.assert_array_equal(blind[:, :1], one)
     np.testing.assert_array_equal(all_[:, :1], one)
-    assert (blind[:, 2] == UNKNOWN).all()
+    assert (blind[:, 2:] == UNKNOWN).all()
     np.testing.assert_array_equal(blind[:, 1], all_[:, 2])
     assert (all_[:, 1:] > UNKNOWN).all()
     # the middle of the surroundings is the window itself, coarser: where it is empty, so is the middle
@@ -127,7 +173,7 @@ def test_the_regularizer_tells_all_it_knows(kit, aabb, crowd):
     )  # fmt: skip
     regularizer(waves_of_tensors)
     given = denoiser.calls[0][0]
-    assert given.shape == (5, 3, 32, 32, 32)
+    assert given.shape == (5, len(CHANNEL_NAMES), 32, 32, 32)
     upright = np.broadcast_to(np.eye(3), (5, 3, 3))
     np.testing.assert_array_equal(
         given[:, 2], encode_view_count(count_views(crowd, cubes.centers, cubes.edges, upright))
@@ -141,7 +187,7 @@ def test_without_cameras_views_are_unknown_and_surroundings_follow_the_rule(kit,
     regularizer, denoiser = build(kit, aabb, CHANNEL_NAMES, soft=False)
     regularizer(waves_of_tensors)
     given = denoiser.calls[0][0]
-    assert (given[:, 2] == UNKNOWN).all()
+    assert (given[:, 2:] == UNKNOWN).all()
     eighths = (given[:, 1] + 0.5) / 1.5 * 8  # means of eight bits
     np.testing.assert_allclose(eighths, np.round(eighths), atol=1e-4)
 
@@ -167,7 +213,7 @@ def test_no_gradient_flows_through_what_is_told(kit, aabb, crowd):
         asked.append(field.asked)
     assert gradients[0] == gradients[1] != 0
     assert asked[0][True] == asked[1][True]
-    assert asked[0][False] == 0 < asked[1][False] <= 5 * 32**3
+    assert asked[0][False] == 0 < asked[1][False] <= 5 * 32**3 + len(crowd) * FAN[0] * FAN[1] * STEPS
 
 
 def test_distorted_cameras_do_for_both(kit, aabb, crowd):
