@@ -1,4 +1,8 @@
 import json
+import signal
+import subprocess
+import sys
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -201,6 +205,44 @@ def test_room_scenes_repeat_and_fit_a_shard(tmp_path):
     assert not np.array_equal(room_scene(1, 3, TINY)[0]["inputs"], arrays["inputs"])
     assert harvest(tmp_path, scenes=1, config=TINY, fit=False) == TINY.cubes
     assert read_shard(tmp_path / "scene-00000", verify=True).provenance["recipe"] == "rooms"
+
+
+KILLED = """
+import sys
+from unghost.data_recipes.harvest import harvest
+from unghost.data_recipes.harvest_config import HarvestConfig
+
+if __name__ == "__main__":
+    harvest(sys.argv[1], scenes=8, seed=2, config=HarvestConfig(cubes=12), fit=False)
+"""
+
+
+def test_a_killed_harvest_goes_on_to_the_same_bytes(tmp_path, whole_bytes):
+    script, out = tmp_path / "killed.py", tmp_path / "out"
+    script.write_text(KILLED, encoding="utf-8")
+    with subprocess.Popen([sys.executable, str(script), str(out)]) as run:
+        deadline = time.monotonic() + 120
+        while not (out / "scene-00001").exists() and time.monotonic() < deadline and run.poll() is None:
+            time.sleep(0.002)
+        run.send_signal(signal.SIGKILL)
+    assert run.returncode == -signal.SIGKILL
+    config = HarvestConfig(cubes=12)
+    time.sleep(1.0)  # its worker ends a moment after it
+    survivors = {path.name: path.stat().st_mtime_ns for path in out.glob("scene-?????")}
+    assert 2 <= len(survivors) < 8
+    assert harvest(out, scenes=8, seed=2, config=config, fit=False) == 8 * config.cubes
+    assert {name: (out / name).stat().st_mtime_ns for name in survivors} == survivors
+    assert harvest(tmp_path / "whole", scenes=8, seed=2, config=config, fit=False, workers=2) == 8 * config.cubes
+    assert whole_bytes(out) == whole_bytes(tmp_path / "whole")
+
+
+def test_a_scene_that_is_there_is_not_made_again(tmp_path):
+    """As after the death of a worker, when the answers of the other ones are lost."""
+    stamps = set()
+    for _ in range(2):
+        assert module._work(str(tmp_path), 3, 5, TINY, False, None) == (5, "")
+        stamps.add((tmp_path / "scene-00005" / "manifest.json").stat().st_mtime_ns)
+    assert len(stamps) == 1
 
 
 @pytest.mark.parametrize("arguments", [{"scenes": 0}, {"scenes": 1, "workers": 0}])
