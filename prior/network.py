@@ -195,12 +195,20 @@ class RestorationNet(nn.Module):
         Returns:
             ``(N, 1, 32, 32, 32)``, unbounded.
         """
+        return self.raw(channels, timestep, edge_fraction, spread=True)
+
+    def raw(self, channels: Tensor, timestep: Tensor, edge_fraction: Tensor, *, spread: bool = False) -> Tensor:
+        """The last layer and the shortcut; of :func:`voxel_features` if ``spread``, else of the channels as they are.
+
+        Diffusion takes the latter: its noisy cubes leave [-1, 1], and the features would cut that off.
+        """
         _check_shapes(channels, timestep, edge_fraction, self.config.channels)
+        features = voxel_features(channels) if spread else channels
         down, bottom, _ = self.config.blocks
         widths = [block.first.in_channels for block in self.blocks]  # type: ignore[union-attr]
         biases = self.condition(condition_features(timestep, edge_fraction)).split(widths, dim=1)
         steps = list(zip(self.blocks, biases))
-        fine = activate(self.stem(space_to_depth(voxel_features(channels))))
+        fine = activate(self.stem(space_to_depth(features)))
         middle = self.down_middle(fine)
         for block, bias in steps[:down]:
             middle = block(middle, bias)
