@@ -49,17 +49,13 @@ def scale_depth(signed: NDArray[np.float32], factor: float) -> NDArray[np.float3
 
 @dataclass(frozen=True)
 class Batch:
-    """``channels (N, 1, R, R, R)``, ``labels (N, R, R, R)``, the rest ``(N,)``; ``harvested``: of a fitted field.
-
-    ``index``: the samples' numbers in the endless stream.
-    """
+    """``channels (N, 1, R, R, R)``, ``labels (N, R, R, R)``, the rest ``(N,)``; ``harvested``: of a fitted field."""
 
     channels: NDArray[np.float32]
     labels: NDArray[np.uint8]
     timestep: NDArray[np.int64]
     edge_fraction: NDArray[np.float32]
     harvested: NDArray[np.bool_]
-    index: NDArray[np.int64]
 
 
 class Mixture:
@@ -113,7 +109,6 @@ class Mixture:
             timestep_from_severity(least + (1.0 - least) * position),
             np.array([shard.edge_fraction[cube] for shard, cube, *_ in draws], dtype=np.float32),
             np.array([_harvested(shard) for shard, *_ in draws]),
-            np.arange(step * batch_size, (step + 1) * batch_size, dtype=np.int64),
         )
 
     def stream(self, first_step: int, batch_size: int, *, ahead: int = 2) -> Iterator[Batch]:

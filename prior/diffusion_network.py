@@ -60,8 +60,8 @@ class DiffusionConfig:
             raise ValueError(f"DiffusionConfig: objective must be one of {OBJECTIVES}, got {self.objective!r}")
         if self.kind != KIND:
             raise ValueError(f"DiffusionConfig: kind must be {KIND!r}, got {self.kind!r}")
-        if self.network.channels != 1:
-            raise ValueError(f"DiffusionConfig: network.channels must be 1, got {self.network.channels}")
+        if self.network.channels != NetworkConfig().channels:
+            raise ValueError(f"DiffusionConfig: network must take signed opacity alone, got {self.network.channels}")
         if self.shortcut is None:
             compact = isinstance(self.network, NetworkConfig)
             object.__setattr__(self, "shortcut", self.objective == "epsilon" and compact)
@@ -69,7 +69,7 @@ class DiffusionConfig:
             raise ValueError(f"DiffusionConfig: shortcut is of objective 'epsilon', got {self.objective!r}")
 
     @property
-    def channels(self) -> int:
+    def channels(self) -> Any:
         """Input channels."""
         return self.network.channels
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ..core.frames import RESOLUTION
 from ..core.occupancy import signed_from_occupancy
-from ..core.schedule import strided_timesteps
+from ..core.schedule import TIMESTEPS, strided_timesteps
 from .diffusion import bernoulli_posterior, epsilon_from_x0, kept_share
 from .diffusion_network import DiffusionNet
 
@@ -149,12 +149,14 @@ def sample_cubes(
         ``(count, 1, 32, 32, 32)`` float32 on the CPU: x0 in [-1, 1], occupied above 0; bits for Bernoulli.
 
     Raises:
-        ValueError: a count or a batch below 1, an edge fraction that is not > 0, ``eta`` with Bernoulli.
+        ValueError: a count or a batch below 1, steps outside [1, 1000], an edge fraction that is not > 0, ``eta`` with Bernoulli.
     """
     if count < 1 or batch_size < 1:
         raise ValueError(f"sample_cubes: count and batch_size must be >= 1, got {count} and {batch_size}")
     if not 0.0 < edge_fraction < float("inf"):
         raise ValueError(f"sample_cubes: edge_fraction must be finite and > 0, got {edge_fraction}")
+    if not 1 <= steps <= TIMESTEPS:
+        raise ValueError(f"sample_cubes: steps must lie in [1, {TIMESTEPS}], got {steps}")
     flips = network.config.objective == "bernoulli"
     if flips and eta != 1.0:
         raise ValueError(f"sample_cubes: eta must be 1 for objective 'bernoulli', got {eta}")

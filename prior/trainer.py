@@ -110,7 +110,8 @@ class Trainer:
         times, edges = (torch.from_numpy(v).to(self.device) for v in (batch.timestep, batch.edge_fraction))
         with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=self.bf16):
             if isinstance(self.network, DiffusionNet):
-                return diffusion_losses(self.network, labels, edges, index=batch.index, seed=self.config.seed)
+                index = np.arange(len(labels)) + self.step * self.config.batch_size
+                return diffusion_losses(self.network, labels, edges, index=index, seed=self.config.seed)
             channels = torch.from_numpy(batch.channels).to(self.device)
             logits = self.network.logits(channels, times, edges)
         kept = torch.from_numpy(np.where(batch.harvested, self.config.keep_weight, 1.0)).to(channels)

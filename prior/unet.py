@@ -25,6 +25,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ..core.frames import RESOLUTION
+from .network import NetworkConfig
 
 KIND = "unet"
 EDGE_FRACTION_LEAST, EDGE_FRACTION_MOST = 0.005, 1.0  # the embedding varies between them, evenly in the logarithm
@@ -38,7 +39,6 @@ class UNetConfig:
 
     Attributes:
         kind: tells this from other networks in a file; always ``"unet"``.
-        channels: input channels; the first is signed occupancy.
         base_width: feature channels at 32^3.
         multipliers: of ``base_width``, at 32^3, 16^3, 8^3, …
         blocks: residual blocks a level in the encoder; the decoder has one more.
@@ -47,7 +47,6 @@ class UNetConfig:
     """
 
     kind: str = KIND
-    channels: int = 1
     base_width: int = 32
     multipliers: tuple[int, ...] = (1, 2, 4)
     blocks: int = 1
@@ -58,7 +57,7 @@ class UNetConfig:
         object.__setattr__(self, "multipliers", tuple(self.multipliers))
         if self.kind != KIND:
             raise ValueError(f"UNetConfig: kind must be {KIND!r}, got {self.kind!r}")
-        for name in ("channels", "base_width", "blocks", "heads", "groups"):
+        for name in ("base_width", "blocks", "heads", "groups"):
             if getattr(self, name) < 1:
                 raise ValueError(f"UNetConfig: {name} must be >= 1, got {getattr(self, name)}")
         if not self.multipliers or min(self.multipliers) < 1 or len(self.multipliers) > 5:
@@ -69,6 +68,11 @@ class UNetConfig:
             )
         if self.widths[-1] % self.heads:
             raise ValueError(f"UNetConfig: heads must divide the coarsest width {self.widths[-1]}, got {self.heads}")
+
+    @property
+    def channels(self) -> Any:
+        """Input channels, as :class:`unghost.prior.network.NetworkConfig` says it: signed opacity alone."""
+        return NetworkConfig().channels
 
     @property
     def widths(self) -> tuple[int, ...]:
@@ -206,7 +210,7 @@ class UNet(nn.Module):
         widths, last = config.widths, len(config.widths) - 1
         self.time = self._embedder(config.base_width)
         self.edge = self._embedder(1 + 2 * EDGE_WAVES)
-        self.first = nn.Conv3d(config.channels, widths[0], 3, padding=1)
+        self.first = nn.Conv3d(1, widths[0], 3, padding=1)
         self.encoder, kept, width = nn.ModuleList(), [widths[0]], widths[0]
         for level, out in enumerate(widths):
             for _ in range(config.blocks):
@@ -245,14 +249,14 @@ class UNet(nn.Module):
         """The network's last layer, whatever it was trained to mean.
 
         Args:
-            channels: ``(N, C, 32, 32, 32)``, unbounded.
+            channels: ``(N, 1, 32, 32, 32)``, unbounded.
             timestep: ``(N,)`` integers in [0, 1000).
             edge_fraction: ``(N,)`` > 0, the cube's edge over the scene's extent.
 
         Returns:
             ``(N, 1, 32, 32, 32)`` float32.
         """
-        _check_shapes(channels, timestep, edge_fraction, self.config.channels)
+        _check_shapes(channels, timestep, edge_fraction)
         embedding = functional.silu(self.embedding(timestep, edge_fraction))
         grid = self.first(channels)
         kept = [grid]
@@ -274,10 +278,10 @@ class UNet(nn.Module):
         return torch.tanh(self.logits(channels, timestep, edge_fraction) / 2.0)
 
 
-def _check_shapes(channels: Tensor, timestep: Tensor, edge_fraction: Tensor, expected: int) -> None:
-    count, cube = len(channels), (RESOLUTION,) * 3
-    if tuple(channels.shape) != (count, expected, *cube):
-        raise ValueError(f"UNet: channels must have shape (N, {expected}, {cube}), got {tuple(channels.shape)}")
+def _check_shapes(channels: Tensor, timestep: Tensor, edge_fraction: Tensor) -> None:
+    count, cube = len(channels), (1, *(RESOLUTION,) * 3)
+    if tuple(channels.shape) != (count, *cube):
+        raise ValueError(f"UNet: channels must have shape (N, *{cube}), got {tuple(channels.shape)}")
     for name, value in (("timestep", timestep), ("edge_fraction", edge_fraction)):
         if tuple(value.shape) != (count,):
             raise ValueError(f"UNet: {name} must have shape ({count},), got {tuple(value.shape)}")
@@ -292,7 +296,7 @@ def unet_gflop(config: UNetConfig) -> float:
 
     with torch.device("meta"):
         network = UNet(config)
-        inputs = (torch.empty(1, config.channels, *(RESOLUTION,) * 3), torch.zeros(1, dtype=torch.long), torch.ones(1))
+        inputs = (torch.empty(1, 1, *(RESOLUTION,) * 3), torch.zeros(1, dtype=torch.long), torch.ones(1))
         with FlopCounterMode(display=False) as counter, torch.no_grad():
             network.raw(*inputs)
     return float(counter.get_total_flops()) / 1e9

@@ -38,11 +38,6 @@ def test_draws_are_uniform_times_and_standard_normals():
     assert draws.std().item() == pytest.approx(1.0, abs=1e-3)
 
 
-def test_batches_number_their_samples(shard_paths):
-    mixture = Mixture([(shard_paths["a"], 1.0)], seed=0)
-    assert mixture.batch(3, 4).index.tolist() == [12, 13, 14, 15]
-
-
 def test_the_corrupted_input_plays_no_part(tiny_config, shard_paths):
     batch = Mixture([(shard_paths["a"], 1.0)], seed=0).batch(0, 3)
     other = dataclasses.replace(batch, channels=-batch.channels, timestep=batch.timestep * 0)
