@@ -149,7 +149,8 @@ def sample_cubes(
         ``(count, 1, 32, 32, 32)`` float32 on the CPU: x0 in [-1, 1], occupied above 0; bits for Bernoulli.
 
     Raises:
-        ValueError: a count or a batch below 1, steps outside [1, 1000], an edge fraction that is not > 0, ``eta`` with Bernoulli.
+        ValueError: a count or a batch below 1, steps outside [1, 1000], an edge fraction that is not > 0, ``eta`` with
+            Bernoulli.
     """
     if count < 1 or batch_size < 1:
         raise ValueError(f"sample_cubes: count and batch_size must be >= 1, got {count} and {batch_size}")
