@@ -1,4 +1,10 @@
-"""Time: integer timesteps in [0, 1000), the paper's noise schedule, and severities mapped onto it."""
+"""Time: integer timesteps in [0, 1000), the paper's noise schedule, and severities mapped onto it.
+
+One table serves both kinds of diffusion. With ``a = alphas_cumprod()[t]``:
+
+    Gaussian    x_t = sqrt(a) x_0 + sqrt(1 - a) noise
+    Bernoulli   x_t = x_0 with its sign flipped with probability (1 - a) / 2, so that E[x_t | x_0] = a x_0
+"""
 
 from __future__ import annotations
 
@@ -17,6 +23,32 @@ def betas() -> NDArray[np.float64]:
 def alphas_cumprod() -> NDArray[np.float64]:
     """``(1000,)`` the paper's alpha-bar."""
     return np.asarray(np.cumprod(1.0 - betas()), dtype=np.float64)
+
+
+def flip_probabilities() -> NDArray[np.float64]:
+    """``(1000,)`` share of voxels whose sign differs from x0: ``(1 - alphas_cumprod) / 2``, from 0.00075 to 0.5.
+
+    Each step replaces a share ``beta`` of the voxels by fair coins (Sohl-Dickstein et al. 2015, Bernoulli diffusion).
+    """
+    return np.asarray((1.0 - alphas_cumprod()) / 2.0, dtype=np.float64)
+
+
+def flip_log_odds() -> NDArray[np.float64]:
+    """``(1000,)`` how much one bit says about its x0: ``log((1 - f) / f)``, from 7.2 down to 8e-12, never negative."""
+    kept = alphas_cumprod()
+    return np.asarray(np.log1p(kept) - np.log1p(-kept), dtype=np.float64)
+
+
+def strided_timesteps(count: int) -> NDArray[np.int64]:
+    """``count`` timesteps from 999 down to 0, evenly spread, both ends among them (999 alone for a count of 1).
+
+    Raises:
+        ValueError: ``count`` outside [1, 1000].
+    """
+    if not 1 <= count <= TIMESTEPS:
+        raise ValueError(f"strided_timesteps: count must lie in [1, {TIMESTEPS}], got {count}")
+    steps: NDArray[np.int64] = np.rint(np.linspace(TIMESTEPS - 1, 0, count)).astype(np.int64)
+    return steps
 
 
 def timestep_from_severity(severity: ArrayLike) -> NDArray[np.int64]:

@@ -19,6 +19,8 @@ OPERATORS = frozenset(
 class GraphBuilder:
     """Collects nodes and initialisers; every method returns the name of its output."""
 
+    operators = OPERATORS  # a subclass that may use others says so
+
     def __init__(self) -> None:
         self.nodes: list[Any] = []
         self.initializers: list[Any] = []
@@ -39,8 +41,8 @@ class GraphBuilder:
         """Append one operator; its output's name, or a list of names if there are several."""
         import onnx.helper
 
-        if operator not in OPERATORS:
-            raise ValueError(f"GraphBuilder: operator {operator} is not among {sorted(OPERATORS)}")
+        if operator not in self.operators:
+            raise ValueError(f"GraphBuilder: operator {operator} is not among {sorted(self.operators)}")
         stem = name or f"{operator.lower()}_{len(self.nodes)}"
         names = [stem] if outputs == 1 else [f"{stem}_{index}" for index in range(outputs)]
         self.nodes.append(onnx.helper.make_node(operator, list(inputs), names, name=stem, **attributes))

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -120,15 +121,22 @@ def _block(graph: GraphBuilder, weights: dict[str, Weights], name: str, value: s
     return graph.node("Add", convolve(_activate(graph, shifted), "second", weights[f"{name}.second.bias"]), value)
 
 
-def _stem(graph: GraphBuilder, weights: dict[str, Weights], names: list[str]) -> str:
-    """Features and first convolution of the aligned channels: ``(N * 8, 2 fine, 16, 16)``."""
+def _spread(graph: GraphBuilder, signed: str) -> str:
+    """``prior.network.voxel_features`` of signed opacity: ``2 sqrt(o) - 1``."""
+    half = graph.constant(0.5)
+    opacity = graph.node("Relu", graph.node("Add", graph.node("Mul", signed, half), half))
+    root = graph.node("Mul", graph.node("Sqrt", opacity), graph.constant(2.0))
+    return graph.node("Sub", root, graph.constant(1.0))
+
+
+def _stem(graph: GraphBuilder, weights: dict[str, Weights], names: list[str], *, spread: bool) -> str:
+    """Features (the first channel's if ``spread``) and first convolution of the aligned channels.
+
+    Returns the name of ``(N * 8, 2 fine, 16, 16)``.
+    """
     plane, channels = RESOLUTION**2, len(names)
     first, others = names[0], names[1:]
-    half = graph.constant(0.5)
-    opacity = graph.node("Relu", graph.node("Add", graph.node("Mul", first, half), half))
-    features = graph.node(
-        "Sub", graph.node("Mul", graph.node("Sqrt", opacity), graph.constant(2.0)), graph.constant(1.0)
-    )
+    features = _spread(graph, first) if spread else first
     if channels > 1:
         joined = graph.node("Concat", features, *others, axis=1)
         features = graph.node("Transpose", joined, perm=[0, 2, 1, 3, 4])
@@ -169,8 +177,16 @@ def _head(graph: GraphBuilder, weights: dict[str, Weights], fine: str) -> str:
     return graph.reshape(out, -1, 1, RESOLUTION, RESOLUTION, RESOLUTION)
 
 
-def planar_model(network: RestorationNet) -> Any:
+def probability(graph: GraphBuilder, logits: str) -> None:
+    """The node ``x0_pred`` of a restoration network: ``tanh(logits / 2)``, that is 2 p - 1."""
+    graph.node("Tanh", graph.node("Mul", logits, graph.constant(0.5)), name="x0_pred")
+
+
+def planar_model(network: RestorationNet, *, tail: Callable[[GraphBuilder, str], Any] | None = None) -> Any:
     """The network as an ONNX ``ModelProto`` without metadata.
+
+    With a ``tail`` the network reads its channels as they are (``RestorationNet.raw``), and the tail makes the node
+    ``x0_pred`` from its last layer.
 
     Inputs ``channels (N, C, 32, 32, 32) float32``, ``timestep (N,) int64``, ``edge_fraction (N,) float32``;
     output ``x0_pred (N, 1, 32, 32, 32)``; N >= 1 is free.
@@ -203,7 +219,7 @@ def planar_model(network: RestorationNet) -> Any:
             value = _block(graph, weights, f"blocks.{index}", value, biases[index], depths[index])
         return value
 
-    fine = _stem(graph, weights, [names[index] for index in config.aligned])
+    fine = _stem(graph, weights, [names[index] for index in config.aligned], spread=tail is None)
     middle = graph.conv(fine, _flat_kernel(weights["down_middle.weight"]), weights["down_middle.bias"], stride=2)
     if beside is not None:
         middle = graph.node("Add", middle, beside)
@@ -218,7 +234,7 @@ def planar_model(network: RestorationNet) -> Any:
     fine = _activate(graph, graph.node("Add", fine, lifted))
     out = _head(graph, weights, fine)
     logits = graph.node("Add", out, graph.node("Mul", names[0], graph.constant(weights["gain"])))
-    graph.node("Tanh", graph.node("Mul", logits, graph.constant(0.5)), name="x0_pred")
+    (tail or probability)(graph, logits)
     cube = (RESOLUTION,) * 3
     inputs = [
         make_tensor_value_info("channels", onnx.TensorProto.FLOAT, ["N", count, *cube]),

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..core.manifest import METADATA_KEY, Manifest
 from ..core.schedule import TIMESTEPS
-from .network import NetworkConfig, RestorationNet
+from .networks import AnyNetwork, build_network, config_from_dict
 
 CONFIG_KEY = "unghost_network"
 
@@ -69,7 +69,7 @@ class TorchDenoiser:
 
     kind = "torch"
 
-    def __init__(self, network: RestorationNet, manifest: Manifest) -> None:
+    def __init__(self, network: AnyNetwork, manifest: Manifest) -> None:
         if manifest.channels != network.config.channels:
             raise ValueError(
                 f"TorchDenoiser: the manifest names the channels {manifest.channels}, "
@@ -99,7 +99,7 @@ class TorchDenoiser:
             TypeError: timesteps that are not integers.
             ValueError: shapes, or values out of range.
         """
-        device = self.network.gain.device
+        device = next(self.network.parameters()).device
         count = (len(channels),)
         times = torch.as_tensor(timestep, device=device)
         if times.is_floating_point() or times.dtype == torch.bool:
@@ -119,7 +119,7 @@ class TorchDenoiser:
         return x0_pred
 
 
-def save_model(path: str | Path, network: RestorationNet, manifest: Manifest) -> None:
+def save_model(path: str | Path, network: AnyNetwork, manifest: Manifest) -> None:
     """Write weights, manifest and network configuration as one safetensors file, atomically."""
     if manifest.channels != network.config.channels:
         raise ValueError(
@@ -130,15 +130,15 @@ def save_model(path: str | Path, network: RestorationNet, manifest: Manifest) ->
     write_tensors(path, network.state_dict(), metadata)
 
 
-def network_from_tensors(tensors: Mapping[str, Tensor], metadata: Mapping[str, str], *, origin: str) -> RestorationNet:
+def network_from_tensors(tensors: Mapping[str, Tensor], metadata: Mapping[str, str], *, origin: str) -> AnyNetwork:
     """Build the network that ``metadata`` describes and fill it; ``origin`` names the file in errors."""
     if CONFIG_KEY not in metadata:
         raise ValueError(f"{origin}: not an unghost checkpoint (its header has no {CONFIG_KEY!r})")
     try:
-        config = NetworkConfig.from_dict(json.loads(metadata[CONFIG_KEY]))
+        config = config_from_dict(json.loads(metadata[CONFIG_KEY]))
     except (ValueError, TypeError) as error:
         raise ValueError(f"{origin}: its network configuration is not readable ({error})") from None
-    network = RestorationNet(config)
+    network = build_network(config)
     try:
         network.load_state_dict(dict(tensors))
     except RuntimeError as error:

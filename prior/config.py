@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from .network import NetworkConfig
+from .networks import BackboneConfig, backbone_from_dict, network_for
 
 
 @dataclass(frozen=True)
@@ -18,7 +19,9 @@ class TrainConfig:
 
     Attributes:
         name: of the model, for its manifest.
-        network: channels, widths and depths.
+        network: channels, widths and depths; a UNetConfig for the paper's U-Net.
+        objective: ``restoration``, or a diffusion: ``epsilon`` (the paper), ``x0``, ``bernoulli``. A diffusion learns
+            the labels (surface or not; "ignore" is not) and leaves the corrupted inputs aside.
         seed: of the initial weights and of the stream of samples.
         steps: optimiser steps; with ``max_seconds`` whichever is over first.
         max_seconds: time budget, or None. The learning rate follows ``max(step / steps, elapsed / max_seconds)``,
@@ -42,14 +45,15 @@ class TrainConfig:
         checkpoint_steps: the same in steps; 0 for by time only.
         validate_seconds: between validations; 0 for at the end only.
         validate_cubes: at most so many of each validation shard while training (all of them at the end).
-        default_timestep: of the manifest.
+        default_timestep: of the manifest; None for 900, or 50 for a diffusion (the paper's range is 10 to 50).
         threshold_from: validation shards, joined by commas; the mean of their thresholds at .98 of the surface kept
             goes to the manifest; "" for 0.
         init_from: checkpoint (``model.safetensors``) to start from, or "".
     """
 
     name: str = "unghost-restoration"
-    network: NetworkConfig = field(default_factory=NetworkConfig)
+    network: BackboneConfig = field(default_factory=NetworkConfig)
+    objective: Literal["restoration", "epsilon", "x0", "bernoulli"] = "restoration"
     seed: int = 0
     steps: int = 30_000
     max_seconds: float | None = None
@@ -70,7 +74,7 @@ class TrainConfig:
     checkpoint_steps: int = 0
     validate_seconds: float = 300.0
     validate_cubes: int = 512
-    default_timestep: int = 900
+    default_timestep: int | None = None
     threshold_from: str = ""
     init_from: str = ""
 
@@ -93,6 +97,7 @@ class TrainConfig:
             raise ValueError(f"TrainConfig: ema_decay must lie in [0, 1), got {self.ema_decay}")
         if self.precision not in ("auto", "bf16", "fp32"):
             raise ValueError(f"TrainConfig: precision must be 'auto', 'bf16' or 'fp32', got {self.precision!r}")
+        network_for(self.objective, self.network)  # refuses an unknown objective
 
     def to_json(self) -> str:
         """One JSON object."""
@@ -106,7 +111,7 @@ class TrainConfig:
             raise ValueError(f"TrainConfig: unknown keys {sorted(set(values) - known)}, known: {sorted(known)}")
         body = dict(values)
         if isinstance(body.get("network"), Mapping):
-            body["network"] = NetworkConfig.from_dict(body["network"])
+            body["network"] = backbone_from_dict(body["network"])
         return cls(**body)
 
     def learning_rate_at(self, step: int, progress: float) -> float:

@@ -209,6 +209,13 @@ class RestorationNet(nn.Module):
         Returns:
             ``(N, 1, 32, 32, 32)``, unbounded.
         """
+        return self.raw(channels, timestep, edge_fraction, spread=True)
+
+    def raw(self, channels: Tensor, timestep: Tensor, edge_fraction: Tensor, *, spread: bool = False) -> Tensor:
+        """The last layer and the shortcut; of :func:`voxel_features` if ``spread``, else of the channels as they are.
+
+        Diffusion takes the latter: its noisy cubes leave [-1, 1], and the features would cut that off.
+        """
         config = self.config
         _check_shapes(channels, timestep, edge_fraction, len(config.channels))
         down, bottom, _ = config.blocks
@@ -217,10 +224,11 @@ class RestorationNet(nn.Module):
             aligned = channels[:, list(config.aligned)]
             beside, pooled = self.context(channels[:, config.surroundings : config.surroundings + 1])
             condition = torch.cat([condition, pooled.to(condition.dtype)], dim=1)
+        features = voxel_features(aligned) if spread else aligned
         widths = [block.first.in_channels for block in self.blocks]  # type: ignore[union-attr]
         biases = self.condition(condition).split(widths, dim=1)
         steps = list(zip(self.blocks, biases))
-        fine = activate(self.stem(space_to_depth(voxel_features(aligned))))
+        fine = activate(self.stem(space_to_depth(features)))
         middle = self.down_middle(fine)
         if beside is not None:
             middle = middle + beside

@@ -1,4 +1,4 @@
-"""Train a restoration prior from shards: checkpoints, validation, logs, a model at the end."""
+"""Train a prior from shards: checkpoints, validation, logs, a model at the end."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from .blend import Blend, Online
 from .checkpoint import TorchDenoiser, save_model
 from .config import TrainConfig
 from .evaluate import evaluate
-from .network import gflop, parameter_count
+from .network import parameter_count
+from .networks import DEFAULT_TIMESTEPS, family, network_gflop
 from .trainer import Trainer
 
 MODEL_FILE, STATE_FILE, CONFIG_FILE, LOG_FILE = "model.safetensors", "state.safetensors", "config.json", "log.jsonl"
@@ -79,8 +80,8 @@ def _provenance(trainer: Trainer, shards: Sequence[tuple[str | Path, float]], bl
     return {
         "seed": config.seed, "steps": trainer.step, "seconds": round(trainer.elapsed, 1),
         "batch_size": config.batch_size, "precision": "bf16" if trainer.bf16 else "fp32", "commit": commit(),
-        "torch": versions().get("torch", ""), "gflop": round(gflop(config.network), 4),
-        "learning_rate": config.learning_rate, "keep_weight": config.keep_weight,
+        "torch": versions().get("torch", ""), "gflop": round(network_gflop(config.network), 4),
+        "objective": config.objective, "learning_rate": config.learning_rate, "keep_weight": config.keep_weight,
         "threshold_from": config.threshold_from, "started_from": trainer.started_from,
         "shards": [
             {"source": Path(path).parent.name, "name": Path(path).name, "weight": weight, "cubes": len(shard)}
@@ -92,9 +93,10 @@ def _provenance(trainer: Trainer, shards: Sequence[tuple[str | Path, float]], bl
 
 
 def _manifest(trainer: Trainer, training: dict[str, Any], threshold: float = 0.0) -> Manifest:
+    kind, timestep = family(trainer.network.config), trainer.config.default_timestep
     return Manifest(
-        name=trainer.config.name, channels=trainer.config.network.channels,
-        default_timestep=trainer.config.default_timestep, removal_threshold=threshold,
+        name=trainer.config.name, family=kind, channels=trainer.config.network.channels, removal_threshold=threshold,
+        default_timestep=DEFAULT_TIMESTEPS[kind] if timestep is None else timestep,
         parameters=parameter_count(trainer.network), training=training,
     )  # fmt: skip
 

@@ -14,8 +14,10 @@ from torch import Tensor, nn
 from .batches import Batch
 from .checkpoint import CONFIG_KEY, load_model, read_tensors, write_tensors
 from .config import TrainConfig
+from .diffusion_network import DiffusionNet
+from .diffusion_training import diffusion_losses
 from .ema import ExponentialMovingAverage
-from .network import RestorationNet
+from .networks import AnyNetwork, build_network, network_for
 from .objective import restoration_loss
 
 
@@ -44,7 +46,7 @@ def _optimizer(network: nn.Module, config: TrainConfig) -> torch.optim.AdamW:
 
 
 class Trainer:
-    """Steps a :class:`RestorationNet`; ``step`` and ``elapsed`` survive :meth:`save` and :meth:`restore`.
+    """Steps a network; ``step`` and ``elapsed`` survive :meth:`save` and :meth:`restore`.
 
     ``started_from`` is the provenance of the weights of ``config.init_from``, or None.
     """
@@ -55,18 +57,18 @@ class Trainer:
         self.bf16 = use_bf16(config.precision, self.device)
         with torch.random.fork_rng(devices=[]):  # the initial weights depend on the seed alone
             torch.manual_seed(config.seed)
-            network = RestorationNet(config.network)
+            network = build_network(network_for(config.objective, config.network))
         self.started_from: dict[str, Any] | None = None
         if config.init_from:
             start = load_model(config.init_from)
-            if start.network.config != config.network:
+            if start.network.config != network.config:
                 raise ValueError(f"Trainer: init_from {config.init_from} has another network: {start.network.config}")
             network.load_state_dict(start.network.state_dict())
             kept = ("seed", "steps", "seconds", "batch_size", "learning_rate", "commit", "shards", "started_from")
             digest = hashlib.sha256(Path(config.init_from).read_bytes()).hexdigest()
             earlier = {key: value for key, value in start.manifest.training.items() if key in kept}
             self.started_from = {"name": start.manifest.name, "sha256": digest, **earlier}
-        self.network = network.to(self.device).to(memory_format=torch.channels_last_3d)  # type: ignore[call-overload]
+        self.network: AnyNetwork = network.to(self.device).to(memory_format=torch.channels_last_3d)  # type: ignore[call-overload]
         self.optimizer = _optimizer(self.network, config)
         self.average = ExponentialMovingAverage(self.network, decay=config.ema_decay)
         self.step = 0
@@ -90,15 +92,7 @@ class Trainer:
         rate = self.config.learning_rate_at(self.step, self.progress)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
-        channels = torch.from_numpy(batch.channels).to(self.device)
-        labels = torch.from_numpy(batch.labels).to(self.device)
-        times, edges = (torch.from_numpy(v).to(self.device) for v in (batch.timestep, batch.edge_fraction))
-        with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=self.bf16):
-            logits = self.network.logits(channels, times, edges)
-        kept = torch.from_numpy(np.where(batch.harvested, self.config.keep_weight, 1.0)).to(channels)
-        loss = restoration_loss(
-            logits, labels, channels[:, :1], interesting_weight=self.config.interesting_weight, keep_weight=kept
-        ).mean()
+        loss = self._losses(batch).mean()
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), self.config.gradient_clip)
@@ -110,9 +104,24 @@ class Trainer:
         self.step += 1
         return values
 
-    def averaged_network(self) -> RestorationNet:
+    def _losses(self, batch: Batch) -> Tensor:
+        """``(N,)`` float32, in the training's precision."""
+        labels = torch.from_numpy(batch.labels).to(self.device)
+        times, edges = (torch.from_numpy(v).to(self.device) for v in (batch.timestep, batch.edge_fraction))
+        with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=self.bf16):
+            if isinstance(self.network, DiffusionNet):
+                index = np.arange(len(labels)) + self.step * self.config.batch_size
+                return diffusion_losses(self.network, labels, edges, index=index, seed=self.config.seed)
+            channels = torch.from_numpy(batch.channels).to(self.device)
+            logits = self.network.logits(channels, times, edges)
+        kept = torch.from_numpy(np.where(batch.harvested, self.config.keep_weight, 1.0)).to(channels)
+        return restoration_loss(
+            logits, labels, channels[:, :1], interesting_weight=self.config.interesting_weight, keep_weight=kept
+        )
+
+    def averaged_network(self) -> AnyNetwork:
         """A separate network holding the averaged weights."""
-        network: RestorationNet = copy.deepcopy(self.network)
+        network: AnyNetwork = copy.deepcopy(self.network)
         network.load_state_dict(self.average.shadow)
         return network
 

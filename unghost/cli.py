@@ -22,7 +22,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     import tyro
 
-    from . import commands, commands_prior
+    from . import commands, commands_prior, commands_sample
 
     verbs: dict[str, Callable[..., Any]] = {
         "demo": commands.demo,
@@ -32,6 +32,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "harvest": commands_prior.harvest,
         "preview": commands_prior.preview,
         "train": commands_prior.train,
+        "sample": commands_sample.sample,
         "export": commands_prior.export,
         "verify": commands_prior.verify,
     }

@@ -221,7 +221,7 @@ def train(
         resume: go on where a killed run stopped.
     """
     from .prior.config import TrainConfig
-    from .prior.network import SIZES
+    from .prior.network import SIZES, NetworkConfig
     from .prior.train import train as run
 
     given: dict[str, Any] = {
@@ -233,6 +233,8 @@ def train(
     if size is not None and size not in SIZES:
         raise ValueError(f"train: --size must be one of {', '.join(SIZES)}, got {size!r}")
     network = base.network if size is None else dataclasses.replace(SIZES[size], channels=base.network.channels)
+    if channels and not isinstance(network, NetworkConfig):
+        raise ValueError(f"train: --channels needs a restoration network, --config names {type(network).__name__}")
     given["network"] = dataclasses.replace(network, channels=channels) if channels else network
     chosen = dataclasses.replace(base, **{key: value for key, value in given.items() if value is not None})
     result = run(

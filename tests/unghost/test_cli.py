@@ -6,7 +6,7 @@ from unghost.commands_prior import expand_shards
 from unghost.core.shards import pack_labels, write_shard
 from unghost.grids import load_grid, save_grid
 
-VERBS = ("demo", "clean", "bench", "curate", "harvest", "preview", "train", "export", "verify")
+VERBS = ("demo", "clean", "bench", "curate", "harvest", "preview", "train", "sample", "export", "verify")
 
 
 def small_shard(folder, count):

@@ -1,0 +1,71 @@
+"""Every network there is, by its configuration: the one place that knows them all."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, TypeAlias
+
+from .diffusion_network import KIND as DIFFUSION
+from .diffusion_network import DiffusionConfig, DiffusionNet
+from .network import NetworkConfig, RestorationNet, gflop
+from .unet import KIND as UNET
+from .unet import UNet, UNetConfig, unet_gflop
+
+BackboneConfig: TypeAlias = NetworkConfig | UNetConfig
+AnyConfig: TypeAlias = NetworkConfig | UNetConfig | DiffusionConfig
+AnyNetwork: TypeAlias = RestorationNet | UNet | DiffusionNet
+
+DEFAULT_TIMESTEPS = {"restoration": 900, "diffusion": 50}  # by family; the paper's range is 10 to 50
+
+_TAGGED: dict[str, type[UNetConfig] | type[DiffusionConfig]] = {UNET: UNetConfig, DIFFUSION: DiffusionConfig}
+
+
+def config_from_dict(values: Mapping[str, Any]) -> AnyConfig:
+    """A network's configuration from parsed JSON; its ``kind`` tells which, and without one it is the restoration's.
+
+    Raises:
+        ValueError: unknown kind or keys, or values that the configuration refuses.
+    """
+    kind = values.get("kind")
+    if kind is None:
+        return NetworkConfig.from_dict(values)
+    if kind not in _TAGGED:
+        raise ValueError(f"config_from_dict: kind must be one of {sorted(_TAGGED)} or absent, got {kind!r}")
+    return _TAGGED[kind].from_dict(values)
+
+
+def backbone_from_dict(values: Mapping[str, Any]) -> BackboneConfig:
+    """The same where a diffusion would be one too many.
+
+    Raises:
+        ValueError: as :func:`config_from_dict`, or ``kind`` is ``"diffusion"``.
+    """
+    config = config_from_dict(values)
+    if isinstance(config, DiffusionConfig):
+        raise ValueError("backbone_from_dict: kind must name a backbone; the diffusion is chosen by the objective")
+    return config
+
+
+def build_network(config: AnyConfig) -> AnyNetwork:
+    """A network with fresh weights from torch's generator."""
+    if isinstance(config, DiffusionConfig):
+        return DiffusionNet(config)
+    return UNet(config) if isinstance(config, UNetConfig) else RestorationNet(config)
+
+
+def network_for(objective: str, config: BackboneConfig) -> AnyConfig:
+    """What a run of ``objective`` trains: the backbone itself for ``"restoration"``, else a diffusion on it."""
+    if objective == "restoration":
+        return config
+    return DiffusionConfig(objective, config)  # type: ignore[arg-type]
+
+
+def family(config: AnyConfig) -> str:
+    """The manifest's word for it: ``"diffusion"`` or ``"restoration"``."""
+    return "diffusion" if isinstance(config, DiffusionConfig) else "restoration"
+
+
+def network_gflop(config: AnyConfig) -> float:
+    """Work for one cube in 10^9 operations (a multiply-add is two)."""
+    backbone = config.network if isinstance(config, DiffusionConfig) else config
+    return unet_gflop(backbone) if isinstance(backbone, UNetConfig) else gflop(backbone)
