@@ -1,0 +1,61 @@
+"""Cubes to calibrate int8 on: from shards, or made from a recipe."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from .export.parity import ParityInputs
+
+
+def calibration_for(checkpoint: str | Path, source: str | Path, *, cubes: int, seed: int) -> ParityInputs:
+    """Calibration inputs for a checkpoint.
+
+    Args:
+        checkpoint: a ``model.safetensors``.
+        source: a shard, a folder of shards (``cubes`` of them evenly spread), or the name or file of a recipe.
+        cubes: how many, >= 1.
+        seed: of the recipe's cubes.
+
+    Raises:
+        FileNotFoundError: no such recipe.
+        ValueError: an unreadable checkpoint or source, or a model of more channels than ``signed_opacity``.
+    """
+    from .core.shards import dequantize_signed
+    from .export.quantize import calibration_inputs
+    from .prior.checkpoint import load_model
+
+    if cubes < 1:
+        raise ValueError(f"calibration_for: cubes must be >= 1, got {cubes}")
+    manifest = load_model(checkpoint).manifest
+    if len(manifest.channels) > 1:
+        raise ValueError(
+            f"calibration_for: int8 is for models of signed_opacity alone, {checkpoint} takes {manifest.channels}"
+        )
+    stored, edges = _stored(Path(source), cubes) if Path(source).is_dir() else _made(source, cubes, seed)
+    signed = dequantize_signed(stored)[:, None]
+    return calibration_inputs(signed, edges, default_timestep=manifest.default_timestep)
+
+
+def _stored(folder: Path, cubes: int) -> tuple[np.ndarray, np.ndarray]:
+    """Inputs and edge fractions of cubes evenly spread over the shards of a folder."""
+    from .commands_prior import expand_shards
+    from .core.shards import read_shard
+
+    shards = [read_shard(path) for path, _ in expand_shards(str(folder))]
+    shares = [len(share) for share in np.array_split(np.arange(cubes), len(shards))]
+    rows = [np.linspace(0, len(shard) - 1, share).astype(np.int64) for shard, share in zip(shards, shares)]
+    inputs = np.concatenate([shard.inputs[row] for shard, row in zip(shards, rows)])
+    return inputs, np.concatenate([shard.edge_fraction[row] for shard, row in zip(shards, rows)])
+
+
+def _made(recipe: str | Path, cubes: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Inputs and edge fractions of the first cubes of a recipe."""
+    from .data_recipes.pairs import make_chunk
+    from .data_recipes.recipe import load_recipe
+
+    arrays = make_chunk(load_recipe(recipe), seed, None, 0, cubes).arrays
+    return arrays["inputs"], arrays["edge_fraction"]
