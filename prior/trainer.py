@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from .batches import Batch
 from .checkpoint import CONFIG_KEY, load_model, read_tensors, write_tensors
 from .config import TrainConfig
+from .distributed import Group
 from .ema import ExponentialMovingAverage
 from .network import RestorationNet
 from .objective import restoration_loss
@@ -46,11 +47,13 @@ def _optimizer(network: nn.Module, config: TrainConfig) -> torch.optim.AdamW:
 class Trainer:
     """Steps a :class:`RestorationNet`; ``step`` and ``elapsed`` survive :meth:`save` and :meth:`restore`.
 
-    ``started_from`` is the provenance of the weights of ``config.init_from``, or None.
+    Of several processes (``group``) each learns from its part of every batch. ``started_from`` is the provenance of
+    the weights of ``config.init_from``, or None.
     """
 
-    def __init__(self, config: TrainConfig) -> None:
+    def __init__(self, config: TrainConfig, *, group: Group | None = None) -> None:
         self.config = config
+        self.group = group or Group()
         self.device = torch.device(config.device)
         self.bf16 = use_bf16(config.precision, self.device)
         with torch.random.fork_rng(devices=[]):  # the initial weights depend on the seed alone
@@ -86,6 +89,7 @@ class Trainer:
 
         Raises:
             TrainingDiverged: the loss or the gradient is not finite; weights are as before the step.
+            RankLost: another process of the run is gone.
         """
         rate = self.config.learning_rate_at(self.step, self.progress)
         for group in self.optimizer.param_groups:
@@ -101,6 +105,7 @@ class Trainer:
         ).mean()
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
+        loss = self.group.average(self.network, loss)
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), self.config.gradient_clip)
         values = {"loss": loss.item(), "gradient_norm": float(norm), "learning_rate": rate}
         if not bool(torch.isfinite(loss.detach()) & torch.isfinite(norm)):
