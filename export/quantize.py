@@ -231,10 +231,10 @@ def export_precisions(
     checkpoint_path: str | Path, folder: str | Path, *, precisions: Sequence[str] = PRECISIONS,
     calibration: ParityInputs | None = None, source: str = "", verify_cubes: int = 8,
 ) -> dict[str, Path]:  # fmt: skip
-    """Export a checkpoint in several precisions: ``NAME.onnx``, ``NAME.fp16.onnx``, ``NAME.int8.onnx``.
+    """Write a checkpoint, or its fp32 export, as ``NAME.onnx``, ``NAME.fp16.onnx`` and ``NAME.int8.onnx``.
 
     Args:
-        checkpoint_path: ``NAME.safetensors``.
+        checkpoint_path: ``NAME.safetensors``, or ``NAME.onnx`` in fp32.
         folder: for the files.
         precisions: which.
         calibration, source, verify_cubes: see :func:`convert_onnx`.
@@ -252,13 +252,19 @@ def export_precisions(
         raise ValueError(f"export_precisions: precisions must be among {', '.join(PRECISIONS)}, got {precisions}")
     if "int8" in precisions and calibration is None:
         raise ValueError("export_precisions: int8 needs calibration inputs")
-    stem, target = Path(checkpoint_path).stem, Path(folder)
-    files = {name: target / (f"{stem}.onnx" if name == "fp32" else f"{stem}.{name}.onnx") for name in precisions}
+    origin, target = Path(checkpoint_path), Path(folder)
+    files = {
+        name: target / (f"{origin.stem}.onnx" if name == "fp32" else f"{origin.stem}.{name}.onnx")
+        for name in precisions
+    }
     with tempfile.TemporaryDirectory(prefix="unghost.") as scratch:
-        plain = files.get("fp32", Path(scratch) / "fp32.onnx")
-        export_onnx(checkpoint_path, plain, verify_cubes=verify_cubes)
+        if origin.suffix == ".onnx":
+            plain = origin
+        else:
+            plain = files.get("fp32", Path(scratch) / "fp32.onnx")
+            export_onnx(origin, plain, verify_cubes=verify_cubes)
         for name, path in files.items():
-            if name != "fp32":
+            if path != plain:
                 convert_onnx(
                     plain, path, precision=name, calibration=calibration, source=source, verify_cubes=verify_cubes
                 )

@@ -25,7 +25,7 @@ from .watch import WATCH_STEPS, LossWatch, complaint
 
 MODEL_FILE, STATE_FILE, CONFIG_FILE, LOG_FILE = "model.safetensors", "state.safetensors", "config.json", "log.jsonl"
 
-BAR_FORMAT = "{percentage:5.1f}% |{bar}| {elapsed} < {remaining}, {postfix}"
+BAR_FORMAT = "{percentage:5.1f}% |{bar}| {elapsed} < {remaining}{postfix}"  # tqdm puts a comma first
 
 
 @dataclass(frozen=True)

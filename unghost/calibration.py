@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
+    from .core.manifest import Manifest
     from .export.parity import ParityInputs
 
 
@@ -15,7 +16,7 @@ def calibration_for(checkpoint: str | Path, source: str | Path, *, cubes: int, s
     """Calibration inputs for a checkpoint.
 
     Args:
-        checkpoint: a ``model.safetensors``.
+        checkpoint: a ``model.safetensors``, or its ``.onnx``.
         source: a shard, a folder of shards (``cubes`` of them evenly spread), or the name or file of a recipe.
         cubes: how many, >= 1.
         seed: of the recipe's cubes.
@@ -26,11 +27,10 @@ def calibration_for(checkpoint: str | Path, source: str | Path, *, cubes: int, s
     """
     from .core.shards import dequantize_signed
     from .export.quantize import calibration_inputs
-    from .prior.checkpoint import load_model
 
     if cubes < 1:
         raise ValueError(f"calibration_for: cubes must be >= 1, got {cubes}")
-    manifest = load_model(checkpoint).manifest
+    manifest = _manifest(Path(checkpoint))
     if len(manifest.channels) > 1:
         raise ValueError(
             f"calibration_for: int8 is for models of signed_opacity alone, {checkpoint} takes {manifest.channels}"
@@ -38,6 +38,16 @@ def calibration_for(checkpoint: str | Path, source: str | Path, *, cubes: int, s
     stored, edges = _stored(Path(source), cubes) if Path(source).is_dir() else _made(source, cubes, seed)
     signed = dequantize_signed(stored)[:, None]
     return calibration_inputs(signed, edges, default_timestep=manifest.default_timestep)
+
+
+def _manifest(path: Path) -> Manifest:
+    if path.suffix == ".onnx":
+        from .export.runtime import read_manifest
+
+        return read_manifest(path)
+    from .prior.checkpoint import load_model
+
+    return load_model(path).manifest
 
 
 def _stored(folder: Path, cubes: int) -> tuple[np.ndarray, np.ndarray]:

@@ -210,7 +210,7 @@ def export(
     """Write a trained prior as portable ONNX files, compared with torch before they appear.
 
     Args:
-        checkpoint: a model.safetensors.
+        checkpoint: a model.safetensors; with --precision also an fp32 .onnx.
         out: the file to write, or with --precision a folder for NAME.onnx, NAME.fp16.onnx and NAME.int8.onnx; beside
             the checkpoint if not given.
         precision: any of fp32, fp16 (weights stored in half precision) and int8; fp32 if not given.

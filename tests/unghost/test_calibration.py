@@ -72,6 +72,15 @@ def test_the_three_verbs_take_every_precision(checkpoint, tmp_path, capsys):
         assert f" cubes/s ({precision}, batch 1," in capsys.readouterr().out
 
 
+def test_an_fp32_file_gives_the_files_of_its_checkpoint(checkpoint, tmp_path):
+    words = ["--precision", "fp32", "int8", "--calibration-cubes", "2", "--out"]
+    assert cli.main(["export", str(checkpoint), *words, str(tmp_path / "a")]) == 0
+    assert cli.main(["export", str(tmp_path / "a" / "small.onnx"), *words, str(tmp_path / "b")]) == 0
+    for name in ("small.onnx", "small.int8.onnx"):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+    assert cli.main(["export", str(tmp_path / "a" / "small.int8.onnx"), *words, str(tmp_path / "c")]) == 2
+
+
 def test_without_a_precision_out_is_one_file(checkpoint, tmp_path):
     assert cli.main(["export", str(checkpoint), "--out", str(tmp_path / "one.onnx")]) == 0
     assert (tmp_path / "one.onnx").is_file()
