@@ -54,6 +54,14 @@ class Group:
                 f"got {config.batch_size} for {self.size}"
             )
 
+    def share(self, batch: Batch) -> Batch:
+        """This rank's rows of a whole batch, for streams that cannot be asked for a part of one."""
+        if self.size == 1:
+            return batch
+        part = len(batch.labels) // self.size
+        rows = slice(self.rank * part, (self.rank + 1) * part)
+        return type(batch)(**{name: value[rows] for name, value in vars(batch).items()})
+
     def average(self, network: nn.Module, loss: Tensor) -> Tensor:
         """Replace the gradients by their mean over ranks, in place; the mean of the loss.
 

@@ -6,6 +6,8 @@ whatever it is asked, and the shortcut from input to output keeps the loss finit
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 
@@ -34,7 +36,7 @@ def input_dependence(network: nn.Module) -> float:
     is zero), of order 1 for one that does. The shortcut around the network has no part in it. In float32.
 
     Args:
-        network: called as ``network(channels, timestep, edge_fraction)``; ``config.channels`` says how many channels.
+        network: called as ``network(channels, timestep, edge_fraction)``; ``config.channels`` says how many channels, or names them.
 
     Raises:
         ValueError: a network without a 3D convolution.
@@ -47,8 +49,9 @@ def input_dependence(network: nn.Module) -> float:
     ]
     device = next(network.parameters()).device
     probes = _probes().to(device)
-    channels = int(network.config.channels)  # type: ignore[union-attr, arg-type]
-    others = probes.new_zeros(2, channels - 1, *probes.shape[2:])
+    channels: Any = network.config.channels  # type: ignore[union-attr]
+    count = channels if isinstance(channels, int) else len(channels)  # a number, or their names
+    others = probes.new_zeros(2, count - 1, *probes.shape[2:])
     times, edges = torch.full((2,), 500, device=device), torch.full((2,), 0.1, device=device)
     try:
         with torch.autocast(device.type, enabled=False):

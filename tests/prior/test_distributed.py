@@ -171,6 +171,9 @@ def test_the_parts_of_the_ranks_are_the_batch(shard_paths, size):
         for field in dataclasses.fields(Batch):
             joined_parts = np.concatenate([getattr(part, field.name) for part in parts])
             np.testing.assert_array_equal(joined_parts, getattr(batch, field.name))
+        for rank, part in enumerate(parts):
+            np.testing.assert_array_equal(Group(rank, size).share(batch).channels, part.channels)
+            np.testing.assert_array_equal(Group(rank, size).share(batch).timestep, part.timestep)
     stream = SharedMixture(shards, group=Group(size - 1, size), seed=5).stream(2, 6)
     np.testing.assert_array_equal(next(stream).labels, whole.batch(2, 6).labels[-6 // size :])
     stream.close()
