@@ -36,7 +36,8 @@ def input_dependence(network: nn.Module) -> float:
     is zero), of order 1 for one that does. The shortcut around the network has no part in it. In float32.
 
     Args:
-        network: called as ``network(channels, timestep, edge_fraction)``; ``config.channels`` says how many channels, or names them.
+        network: called as ``network(channels, timestep, edge_fraction)``; ``config.channels`` says how many channels,
+            or names them.
 
     Raises:
         ValueError: a network without a 3D convolution.
