@@ -16,6 +16,7 @@ from pathlib import Path
 
 from ..core.manifest import METADATA_KEY, Manifest
 
+PRECISIONS = ("fp32", "fp16", "int8")
 METADATA_TAG, KEY_TAG, VALUE_TAG = b"\x72", b"\x0a", b"\x12"  # fields 14, 1 and 2, length-delimited
 
 
@@ -96,3 +97,21 @@ def unseal(data: bytes, *, origin: str) -> Manifest:
     if hashlib.sha256(body).hexdigest() != manifest.body_sha256:
         raise ValueError(f"{origin}: the body does not match the SHA-256 in its manifest: altered or damaged")
     return manifest
+
+
+def body_of(data: bytes, manifest: Manifest) -> bytes:
+    """The model body of a whole file whose manifest :func:`unseal` gave."""
+    return data[: manifest.body_bytes]
+
+
+def precision_of(manifest: Manifest) -> str:
+    """``"fp32"``, ``"fp16"`` or ``"int8"``: what ``training["export"]["precision"]`` says, fp32 where nothing does.
+
+    Raises:
+        ValueError: another precision.
+    """
+    export = manifest.training.get("export")
+    precision = export.get("precision") if isinstance(export, dict) else "fp32"
+    if precision not in PRECISIONS:
+        raise ValueError(f"{manifest.name}: precision must be one of {', '.join(PRECISIONS)}, got {precision!r}")
+    return str(precision)

@@ -1,4 +1,4 @@
-"""How far an ONNX denoiser is from the checkpoint it was made from."""
+"""How far an ONNX denoiser is from the checkpoint it was made from, and how far each precision may be."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,11 +24,25 @@ from ..core.frames import RESOLUTION, unit_lattice
 from ..core.manifest import Denoiser, Manifest
 from ..core.occupancy import EMPTY, OCCUPIED, occupancy_from_signed, signed_from_opacity
 from ..core.schedule import TIMESTEPS
-
-if TYPE_CHECKING:
-    from ..prior.checkpoint import TorchDenoiser
+from .container import precision_of
 
 ERROR_TOLERANCE, FLIP_TOLERANCE = 1e-4, 1e-5
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """Largest ``max_error`` and ``mean_error`` of ``x0_pred`` (in [-1, 1]), and ``flip_rate`` of voxels, that pass."""
+
+    max_error: float
+    mean_error: float
+    flip_rate: float
+
+
+TOLERANCES = {
+    "fp32": Tolerance(ERROR_TOLERANCE, ERROR_TOLERANCE, FLIP_TOLERANCE),
+    "fp16": Tolerance(0.02, 5e-4, 2e-4),
+    "int8": Tolerance(2.0, 0.04, 0.02),  # single voxels may go anywhere; what counts is how many do
+}  # on parity_inputs, most of which look like nothing a denoiser is made for; see docs/formats.md for what was measured
 
 
 @dataclass(frozen=True)
@@ -92,6 +106,29 @@ def parity_inputs(cubes: int, seed: int, *, channels: Sequence[str] = (SIGNED_OP
     return ParityInputs(values, times, edges)
 
 
+def check_inputs(inputs: ParityInputs, *, caller: str) -> None:
+    """Refuse inputs of which a denoiser would refuse some.
+
+    Raises:
+        ValueError: no cubes, wrong shapes or dtypes, values that are not finite or out of range.
+    """
+    count, cube = len(inputs.channels), (RESOLUTION,) * 3
+    if count < 1 or inputs.channels.ndim != 5 or inputs.channels.shape[2:] != cube:
+        raise ValueError(f"{caller}: channels must have shape (N, C, 32, 32, 32), N >= 1, got {inputs.channels.shape}")
+    dtypes = (inputs.channels.dtype, inputs.timestep.dtype, inputs.edge_fraction.dtype)
+    if dtypes != (np.dtype(np.float32), np.dtype(np.int64), np.dtype(np.float32)):
+        raise ValueError(f"{caller}: dtypes must be float32, int64, float32, got {', '.join(map(str, dtypes))}")
+    if inputs.timestep.shape != (count,) or inputs.edge_fraction.shape != (count,):
+        shapes = (inputs.timestep.shape, inputs.edge_fraction.shape)
+        raise ValueError(f"{caller}: timestep and edge_fraction must have shape ({count},), got {shapes}")
+    if not (np.abs(inputs.channels) <= 1.0).all():
+        raise ValueError(f"{caller}: channels must be finite and in [-1, 1]")
+    if not ((inputs.timestep >= 0) & (inputs.timestep < TIMESTEPS)).all():
+        raise ValueError(f"{caller}: timestep must lie in [0, {TIMESTEPS})")
+    if not ((inputs.edge_fraction > 0) & np.isfinite(inputs.edge_fraction)).all():
+        raise ValueError(f"{caller}: edge_fraction must be finite and > 0")
+
+
 def session_denoiser(body: bytes, manifest: Manifest) -> Denoiser:
     """A denoiser from a model that is not on disk yet."""
     import onnxruntime
@@ -111,28 +148,38 @@ def session_denoiser(body: bytes, manifest: Manifest) -> Denoiser:
     return _Session()
 
 
-def compare(exported: Denoiser, reference: TorchDenoiser, inputs: ParityInputs) -> dict[str, Any]:
+def _answer(denoiser: Denoiser, asked: tuple[NDArray[Any], ...]) -> NDArray[Any]:
+    """``x0_pred`` of either kind of denoiser, as an array."""
+    if denoiser.kind == "torch":
+        import torch
+
+        return np.asarray(denoiser(*(torch.from_numpy(value) for value in asked)).numpy())
+    return np.asarray(denoiser(*asked))
+
+
+def compare(exported: Denoiser, reference: Denoiser, inputs: ParityInputs) -> dict[str, Any]:
     """Run both and count.
 
     Returns:
         ``cubes``, ``max_error``, ``mean_error`` (of ``x0_pred``), ``flips`` and ``flip_rate`` (voxels on
-        different sides of the decision), ``passed`` (within 1e-4 and 1e-5).
+        different sides of the decision), ``precision`` (of ``exported``), ``passed`` (within the precision's
+        :data:`TOLERANCES`).
     """
-    import torch
-
     worst, total, flips, voxels = 0.0, 0.0, 0, 0
     for start in range(0, len(inputs.channels), 32):
         part = slice(start, start + 32)
         asked = (inputs.channels[part], inputs.timestep[part], inputs.edge_fraction[part])
-        expected = reference(*(torch.from_numpy(value) for value in asked)).numpy()
-        found = np.asarray(exported(*asked))
+        expected, found = _answer(reference, asked), _answer(exported, asked)
         error = np.abs(found.astype(np.float64) - expected)
         worst = max(worst, float(error.max()) if np.isfinite(error).all() else math.inf)
         total, voxels = total + float(error.sum()), voxels + error.size
         flips += int((occupancy_from_signed(found) != occupancy_from_signed(expected)).sum())
+    precision = precision_of(exported.manifest)
+    allowed = TOLERANCES[precision]
+    passed = worst <= allowed.max_error and total / voxels <= allowed.mean_error and flips / voxels <= allowed.flip_rate
     return {
         "cubes": len(inputs.channels), "max_error": worst, "mean_error": total / voxels, "flips": flips,
-        "flip_rate": flips / voxels, "passed": worst < ERROR_TOLERANCE and flips / voxels <= FLIP_TOLERANCE,
+        "flip_rate": flips / voxels, "precision": precision, "passed": passed,
     }  # fmt: skip
 
 

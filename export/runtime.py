@@ -12,39 +12,49 @@ from numpy.typing import NDArray
 from ..core.frames import RESOLUTION
 from ..core.manifest import Manifest
 from ..core.schedule import check_timestep
-from .container import unseal
+from .container import precision_of, unseal
 
+PREFERRED = ("CUDAExecutionProvider", "CPUExecutionProvider")
 CHUNK = 64  # cubes in one call of onnxruntime; bounds the memory of large batches
 
 
 def read_manifest(path: str | Path) -> Manifest:
     """The manifest of an ONNX file, after checking the whole file against it."""
-    return unseal(_read(path), origin=str(path))
+    return unseal(read_file(path), origin=str(path))
 
 
-def _read(path: str | Path) -> bytes:
+def read_file(path: str | Path) -> bytes:
+    """The bytes of a file; ValueError if there is none."""
     source = Path(path)
     if not source.is_file():
         raise ValueError(f"{source}: no such file")
     return source.read_bytes()
 
 
+def choose_providers(asked: Sequence[str] | None, available: Sequence[str]) -> list[str]:
+    """Execution providers in order: those asked for, or else CUDA where onnxruntime has it, then the CPU.
+
+    Raises:
+        ValueError: none, or one that ``available`` does not hold.
+    """
+    chosen = [name for name in PREFERRED if name in available] if asked is None else list(asked)
+    missing = [name for name in chosen if name not in available]
+    if missing or not chosen:
+        raise ValueError(f"OnnxDenoiser: providers {missing} are not available, onnxruntime has {list(available)}")
+    return chosen
+
+
 def _open(data: bytes, threads: int | None, providers: Sequence[str] | None, origin: str) -> Any:
     import onnxruntime
 
-    available = onnxruntime.get_available_providers()
-    if providers is None:
-        providers = [name for name in ("CUDAExecutionProvider", "CPUExecutionProvider") if name in available]
-    missing = [name for name in providers if name not in available]
-    if missing:
-        raise ValueError(f"OnnxDenoiser: providers {missing} are not available, onnxruntime has {available}")
+    chosen = choose_providers(providers, onnxruntime.get_available_providers())
     options = onnxruntime.SessionOptions()
     if threads is not None:
         if threads < 1:
             raise ValueError(f"OnnxDenoiser: threads must be >= 1 or None, got {threads}")
         options.intra_op_num_threads = threads
     try:
-        return onnxruntime.InferenceSession(data, options, providers=list(providers))
+        return onnxruntime.InferenceSession(data, options, providers=chosen)
     except Exception as error:  # onnxruntime's errors share no public base class
         raise ValueError(f"{origin}: onnxruntime cannot load it ({error})") from None
 
@@ -76,15 +86,17 @@ class OnnxDenoiser:
         """Open and check a file.
 
         Args:
-            path: of ``unghost.export.to_onnx.export_onnx``.
+            path: of ``unghost.export.to_onnx.export_onnx`` or ``unghost.export.quantize.convert_onnx``: fp32, fp16
+                or int8 (``precision`` says which), all with float32 inputs and outputs.
             threads: of onnxruntime, inside operators; None leaves it the choice.
             providers: execution providers in order; None for CUDA where there is one, then the CPU.
 
         Raises:
             ValueError: missing, truncated, foreign or altered file; unknown provider.
         """
-        data = _read(path)
+        data = read_file(path)
         self.manifest = unseal(data, origin=str(path))
+        self.precision = precision_of(self.manifest)
         self._session = _open(data, threads, providers, str(path))
 
     @property

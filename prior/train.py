@@ -19,14 +19,16 @@ from .batches import Mixture
 from .blend import Blend, Online
 from .checkpoint import TorchDenoiser, save_model
 from .config import TrainConfig
+from .distributed import Group, joined
 from .evaluate import evaluate
 from .network import parameter_count
 from .networks import DEFAULT_TIMESTEPS, family, network_gflop
-from .trainer import Trainer
+from .trainer import Trainer, TrainingDiverged
+from .watch import WATCH_STEPS, LossWatch, complaint
 
 MODEL_FILE, STATE_FILE, CONFIG_FILE, LOG_FILE = "model.safetensors", "state.safetensors", "config.json", "log.jsonl"
 
-BAR_FORMAT = "{percentage:5.1f}% |{bar}| {elapsed} < {remaining}, {postfix}"
+BAR_FORMAT = "{percentage:5.1f}% |{bar}| {elapsed} < {remaining}{postfix}"  # tqdm puts a comma first
 
 
 @dataclass(frozen=True)
@@ -41,14 +43,18 @@ class TrainResult:
 
 
 class _Log:
-    """JSON lines, and TensorBoard where it is installed."""
+    """JSON lines, and TensorBoard where it is installed; nothing at all if not ``writes``."""
 
-    def __init__(self, folder: Path) -> None:
-        self._path = folder / LOG_FILE
+    def __init__(self, folder: Path, *, writes: bool = True) -> None:
+        self._path, self._board, self._writes = folder / LOG_FILE, None, writes
+        if not writes:
+            return
+        if self._path.is_file() and self._path.read_bytes()[-1:] not in (b"", b"\n"):
+            self._append("")  # a run was killed while it wrote: what follows begins on a line of its own
         try:
             from torch.utils.tensorboard import SummaryWriter
         except ImportError:
-            self._board = None
+            pass
         else:
             self._board = SummaryWriter(str(folder / "tensorboard"))
 
@@ -60,8 +66,12 @@ class _Log:
 
     def line(self, step: int, kind: str, values: Mapping[str, Any]) -> None:
         """To the log file."""
+        if self._writes:
+            self._append(json.dumps({"step": step, "kind": kind, **values}))
+
+    def _append(self, text: str) -> None:
         with self._path.open("a", encoding="utf-8") as stream:
-            stream.write(json.dumps({"step": step, "kind": kind, **values}) + "\n")
+            stream.write(text + "\n")
 
     def close(self) -> None:
         if self._board is not None:
@@ -136,17 +146,26 @@ def _finish(
     return scores
 
 
-def _prepare(config: TrainConfig, out: Path, resume: bool) -> Trainer:
+def _prepare(config: TrainConfig, out: Path, resume: bool, group: Group) -> Trainer:
     """A trainer, fresh or restored; the configuration is on disk before the first step."""
+    group.check(config)
     state = out / STATE_FILE
     if state.exists() and not resume:
         raise FileExistsError(f"train: {out} holds a run already; resume it, or name another folder")
     out.mkdir(parents=True, exist_ok=True)
-    _write_text(out / CONFIG_FILE, config.to_json())
-    trainer = Trainer(config)
+    if group.first:
+        _write_text(out / CONFIG_FILE, config.to_json())
+    trainer = Trainer(config, group=group)
     if resume and state.exists():
         trainer.restore(state)
     return trainer
+
+
+def _check(trainer: Trainer, losses: LossWatch) -> None:
+    """Stop a run that is not learning any more, before its state is kept."""
+    reason = complaint(trainer.network, losses)
+    if reason is not None:
+        raise TrainingDiverged(f"train: step {trainer.step}: {reason}")
 
 
 def _run(
@@ -156,28 +175,33 @@ def _run(
     """Step until the budget is used; why it ended."""
     from tqdm import tqdm
 
-    config = trainer.config
-    bar = tqdm(total=1.0, initial=trainer.progress, disable=not progress, dynamic_ncols=True, bar_format=BAR_FORMAT)
+    config, group, losses = trainer.config, trainer.group, LossWatch()
+    hidden = not (progress and group.first)
+    bar = tqdm(total=1.0, initial=trainer.progress, disable=hidden, dynamic_ncols=True, bar_format=BAR_FORMAT)
     begun, carried = time.monotonic(), trainer.elapsed
-    first, saved, validated, shown = trainer.step, begun, begun, 0.0
+    first, saved, validated = trainer.step, begun, begun
     batches = blend.stream(trainer.step)
     try:
         while trainer.progress < 1.0:
-            values = trainer.learn(next(batches))
+            values = trainer.learn(group.share(next(batches)))
             now = time.monotonic()
-            trainer.elapsed = carried + now - begun
-            shown = values["loss"] if not shown else 0.98 * shown + 0.02 * values["loss"]
+            elapsed = carried + now - begun
+            trainer.elapsed = group.agree(elapsed) if config.max_seconds else elapsed
+            losses.add(values["loss"])
             rate = (trainer.step - first) * config.batch_size / max(now - begun, 1e-9)
-            bar.set_postfix_str(f"step {trainer.step}, loss {shown:.4f}, {rate:.0f} cubes/s", refresh=False)
+            bar.set_postfix_str(f"step {trainer.step}, loss {losses.running:.4f}, {rate:.0f} cubes/s", refresh=False)
             bar.update(trainer.progress - bar.n)
             if trainer.step % 20 == 0 or trainer.step == 1:
                 log.scalars(trainer.step, {f"train/{key}": value for key, value in values.items()})
                 log.line(trainer.step, "train", {**values, "seconds": round(trainer.elapsed, 1)})
             due = config.checkpoint_steps and trainer.step % config.checkpoint_steps == 0
-            if due or now - saved > config.checkpoint_seconds:
+            due = group.first and (due or now - saved > config.checkpoint_seconds)
+            if due or trainer.step % WATCH_STEPS == 0:
+                _check(trainer, losses)
+            if due:
                 trainer.save(out / STATE_FILE)
                 saved = time.monotonic()
-            if config.validate_seconds and validation and now - validated > config.validate_seconds:
+            if group.first and config.validate_seconds and validation and now - validated > config.validate_seconds:
                 _log_validation(log, trainer.step, _validate(trainer, validation, config.validate_cubes))
                 validated = time.monotonic()
             if on_step is not None:
@@ -185,6 +209,7 @@ def _run(
     finally:
         batches.close()  # type: ignore[attr-defined]
         bar.close()
+    _check(trainer, losses)
     return "steps" if trainer.step >= config.steps else "max_seconds"
 
 
@@ -212,7 +237,8 @@ def train(
 
     Also written: ``config.json`` before the first step, ``state.safetensors`` (everything needed to go on),
     ``log.jsonl``, ``tensorboard/``, ``validation.json``. On a CPU in fp32 with a budget of steps, a run that
-    was killed and resumed ends with the same bits as one that was not.
+    was killed and resumed ends with the same bits as one that was not. Under ``torchrun`` each process learns from its
+    part of every batch and the first alone writes and validates (:mod:`.distributed`).
 
     Args:
         config: the run.
@@ -227,7 +253,9 @@ def train(
         on_step: called after each step with its number and ``loss, gradient_norm, learning_rate``.
 
     Raises:
-        TrainingDiverged: loss or gradient not finite; the last checkpoint is kept.
+        TrainingDiverged: loss or gradient not finite, a running loss far above its lowest, or a network that does not
+            see its input any more; the last checkpoint is kept.
+        RankLost: another process of the run is gone.
         FileExistsError: ``out`` holds a run and ``resume`` is False.
         ValueError: an unreadable shard, an unknown ``threshold_from``.
     """
@@ -239,13 +267,15 @@ def train(
     if config.threads:
         torch.set_num_threads(config.threads)
     folder = Path(out)
-    trainer = _prepare(config, folder, resume)
-    log = _Log(folder)
-    try:
-        reason = _run(trainer, blend, folder, log, validation, progress, on_step)
-        trainer.save(folder / STATE_FILE)
-        scores = _finish(trainer, folder, _provenance(trainer, train_shards, blend), validation)
-        _log_validation(log, trainer.step, scores)
-    finally:
-        log.close()
+    with joined(config.device) as group:
+        trainer = _prepare(config, folder, resume, group)
+        log, scores = _Log(folder, writes=group.first), {}
+        try:
+            reason = _run(trainer, blend, folder, log, validation, progress, on_step)
+            if group.first:
+                trainer.save(folder / STATE_FILE)
+                scores = _finish(trainer, folder, _provenance(trainer, train_shards, blend), validation)
+                _log_validation(log, trainer.step, scores)
+        finally:
+            log.close()
     return TrainResult(folder / MODEL_FILE, trainer.step, trainer.elapsed, reason, scores)

@@ -16,6 +16,7 @@ from .checkpoint import CONFIG_KEY, load_model, read_tensors, write_tensors
 from .config import TrainConfig
 from .diffusion_network import DiffusionNet
 from .diffusion_training import diffusion_losses
+from .distributed import Group
 from .ema import ExponentialMovingAverage
 from .networks import AnyNetwork, build_network, network_for
 from .objective import restoration_loss
@@ -48,11 +49,13 @@ def _optimizer(network: nn.Module, config: TrainConfig) -> torch.optim.AdamW:
 class Trainer:
     """Steps a network; ``step`` and ``elapsed`` survive :meth:`save` and :meth:`restore`.
 
-    ``started_from`` is the provenance of the weights of ``config.init_from``, or None.
+    Of several processes (``group``) each learns from its part of every batch. ``started_from`` is the provenance of
+    the weights of ``config.init_from``, or None.
     """
 
-    def __init__(self, config: TrainConfig) -> None:
+    def __init__(self, config: TrainConfig, *, group: Group | None = None) -> None:
         self.config = config
+        self.group = group or Group()
         self.device = torch.device(config.device)
         self.bf16 = use_bf16(config.precision, self.device)
         with torch.random.fork_rng(devices=[]):  # the initial weights depend on the seed alone
@@ -88,6 +91,7 @@ class Trainer:
 
         Raises:
             TrainingDiverged: the loss or the gradient is not finite; weights are as before the step.
+            RankLost: another process of the run is gone.
         """
         rate = self.config.learning_rate_at(self.step, self.progress)
         for group in self.optimizer.param_groups:
@@ -95,6 +99,7 @@ class Trainer:
         loss = self._losses(batch).mean()
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
+        loss = self.group.average(self.network, loss)
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), self.config.gradient_clip)
         values = {"loss": loss.item(), "gradient_norm": float(norm), "learning_rate": rate}
         if not bool(torch.isfinite(loss.detach()) & torch.isfinite(norm)):
@@ -110,7 +115,8 @@ class Trainer:
         times, edges = (torch.from_numpy(v).to(self.device) for v in (batch.timestep, batch.edge_fraction))
         with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=self.bf16):
             if isinstance(self.network, DiffusionNet):
-                index = np.arange(len(labels)) + self.step * self.config.batch_size
+                first = self.step * self.config.batch_size + self.group.rank * len(labels)
+                index = np.arange(first, first + len(labels))
                 return diffusion_losses(self.network, labels, edges, index=index, seed=self.config.seed)
             channels = torch.from_numpy(batch.channels).to(self.device)
             logits = self.network.logits(channels, times, edges)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -233,38 +234,68 @@ def train(
     if size is not None and size not in SIZES:
         raise ValueError(f"train: --size must be one of {', '.join(SIZES)}, got {size!r}")
     network = base.network if size is None else dataclasses.replace(SIZES[size], channels=base.network.channels)
-    if channels and not isinstance(network, NetworkConfig):
-        raise ValueError(f"train: --channels needs a restoration network, --config names {type(network).__name__}")
-    given["network"] = dataclasses.replace(network, channels=channels) if channels else network
+    if channels:
+        if not isinstance(network, NetworkConfig):
+            raise ValueError(f"train: --channels needs a restoration network, --config has a {type(network).__name__}")
+        network = dataclasses.replace(network, channels=channels)
+    given["network"] = network
     chosen = dataclasses.replace(base, **{key: value for key, value in given.items() if value is not None})
     result = run(
         chosen, train_shards=[pair for spec in shards for pair in expand_shards(spec)],
         validation_shards=_named_shards(validation), out=out, resume=resume, progress=True,
         online=_online(online, seed=chosen.seed, workers=online_workers, mesh_root=mesh_root),
     )  # fmt: skip
+    if os.environ.get("RANK", "0") != "0":
+        return  # one process of torchrun speaks for all
     print(f"{result.steps} steps in {result.seconds:.0f} s, ended by {result.reason}; model: {result.model}")
     for shard, row in result.validation.items():
         print(f"  {shard}: IoU {row['iou_before']} -> {row['iou']}")
 
 
-def export(checkpoint: Positional[Path], out: Path | None = None) -> None:
-    """Write a trained prior as one portable ONNX file, compared with torch before it appears.
+def export(
+    checkpoint: Positional[Path], out: Path | None = None, precision: tuple[Literal["fp32", "fp16", "int8"], ...] = (),
+    calibration: str = "procedural", calibration_cubes: int = 96, seed: int = 0,
+) -> None:  # fmt: skip
+    """Write a trained prior as portable ONNX files, compared with torch before they appear.
 
     Args:
-        checkpoint: a model.safetensors.
-        out: the file to write; the checkpoint's name with .onnx if not given.
+        checkpoint: a model.safetensors; with --precision also an fp32 .onnx.
+        out: the file to write, or with --precision a folder for NAME.onnx, NAME.fp16.onnx and NAME.int8.onnx; beside
+            the checkpoint if not given.
+        precision: any of fp32, fp16 (weights stored in half precision) and int8; fp32 if not given.
+        calibration: for int8, a shard, a folder of shards, or a recipe's name: cubes like those the prior will meet.
+        calibration_cubes: how many of them.
+        seed: of a recipe's cubes.
     """
+    from .calibration import calibration_for
+    from .export.quantize import export_precisions
+    from .export.runtime import read_manifest
     from .export.to_onnx import export_onnx
 
-    target = out or checkpoint.with_suffix(".onnx")
-    manifest = export_onnx(checkpoint, target)
-    print(f"{target}: {target.stat().st_size / 1e6:.2f} MB, {manifest.parameters} parameters, {manifest.body_sha256}")
+    if precision:
+        inputs = None
+        if "int8" in precision:
+            inputs = calibration_for(checkpoint, calibration, cubes=calibration_cubes, seed=seed)
+        written = export_precisions(
+            checkpoint,
+            out or checkpoint.parent,
+            precisions=precision,
+            calibration=inputs,
+            source=Path(calibration).name,
+        )
+        files = list(written.values())
+    else:
+        files = [out or checkpoint.with_suffix(".onnx")]
+        export_onnx(checkpoint, files[0])
+    for path in files:
+        manifest = read_manifest(path)
+        print(f"{path}: {path.stat().st_size / 1e6:.2f} MB, {manifest.parameters} parameters, {manifest.body_sha256}")
 
 
 def verify(
     onnx: Path | None = None, checkpoint: Path | None = None, cubes: int = 256, seed: int = 0, out: Path | None = None
 ) -> int:
-    """State how far an ONNX file is from its checkpoint in torch; exit status 1 if too far.
+    """State how far an ONNX file is from its checkpoint in torch; exit status 1 if too far for its precision.
 
     Args:
         onnx: the exported file; the shipped one if not given.
@@ -279,8 +310,9 @@ def verify(
 
     onnx, checkpoint = onnx or WEIGHTS / "default.onnx", checkpoint or WEIGHTS / "default.safetensors"
     report = run(onnx, checkpoint, cubes=cubes, seed=seed)
-    print(f"max error {report['max_error']:.2e}, occupancy flips {report['flip_rate']:.2e} of the voxels "
-          f"of {report['cubes']} cubes: {'passed' if report['passed'] else 'FAILED'}")  # fmt: skip
+    print(f"{report['precision']}: max error {report['max_error']:.2e}, mean {report['mean_error']:.2e}, "
+          f"occupancy flips {report['flip_rate']:.2e} of the voxels of {report['cubes']} cubes: "
+          f"{'passed' if report['passed'] else 'FAILED'}")  # fmt: skip
     if out is not None:
         write_results(out, build_results([{"method": "onnx", **report}], seeds=[seed]))
     return 0 if report["passed"] else 1

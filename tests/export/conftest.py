@@ -6,10 +6,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
+from unghost.bench import sample_channels
 from unghost.core.manifest import Manifest
+from unghost.export.parity import ParityInputs
+from unghost.export.quantize import calibration_inputs, export_precisions
 from unghost.export.to_onnx import export_onnx
 from unghost.prior.checkpoint import save_model
 from unghost.prior.network import NetworkConfig, RestorationNet
@@ -57,3 +61,22 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Exported:
 def make_lively() -> Callable[[NetworkConfig], RestorationNet]:
     """A network from a configuration; see :func:`lively_network`."""
     return lively_network
+
+
+@pytest.fixture(scope="session")
+def calibration() -> ParityInputs:
+    """Noisy balls and shells."""
+    return calibration_inputs(sample_channels(24, 1, seed=5), np.full(24, 0.1), default_timestep=640)
+
+
+@pytest.fixture(scope="session")
+def precisions(
+    exported: Exported, calibration: ParityInputs, tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, Path]:
+    """The default architecture with random weights in every precision; :func:`exported`'s file for fp32."""
+    folder = tmp_path_factory.mktemp("precisions")
+    files = export_precisions(
+        exported.checkpoint, folder, precisions=("fp16", "int8"), calibration=calibration, source="balls",
+        verify_cubes=0,
+    )  # fmt: skip
+    return {"fp32": exported.onnx, **files}

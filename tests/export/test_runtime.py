@@ -1,3 +1,4 @@
+import dataclasses
 import math
 import subprocess
 import sys
@@ -5,17 +6,20 @@ import textwrap
 
 import numpy as np
 import onnx
+import onnxruntime
 import pytest
 import torch
 
 from unghost.core.manifest import Manifest
-from unghost.export.container import write_sealed
-from unghost.export.runtime import CHUNK, OnnxDenoiser
+from unghost.export.container import PRECISIONS, write_sealed
+from unghost.export.parity import TOLERANCES
+from unghost.export.runtime import CHUNK, OnnxDenoiser, choose_providers, read_manifest
 
 
-@pytest.fixture(scope="module")
-def denoiser(exported):
-    return OnnxDenoiser(exported.onnx, threads=1)
+@pytest.fixture(scope="module", params=PRECISIONS)
+def denoiser(precisions, request):
+    """Every test that takes it is part of the contract of all precisions."""
+    return OnnxDenoiser(precisions[request.param], threads=1)
 
 
 def make_cubes(count, seed=0):
@@ -29,8 +33,11 @@ def test_equals_torch(exported, denoiser):
     found = denoiser(cubes, times, edges)
     assert found.dtype == np.float32
     assert denoiser.kind == "numpy"
-    assert denoiser.manifest == exported.manifest
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-4)
+    for name in ("name", "channels", "default_timestep", "removal_threshold", "family"):
+        assert getattr(denoiser.manifest, name) == getattr(exported.manifest, name)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=TOLERANCES[denoiser.precision].max_error)
+    if denoiser.precision == "fp32":
+        assert denoiser.manifest == exported.manifest
 
 
 def test_scalars_broadcast(denoiser):
@@ -53,6 +60,14 @@ def test_large_batches_are_cut_into_chunks(denoiser):
     for index in (0, CHUNK - 1, CHUNK, count - 1):
         part = slice(index, index + 1)
         np.testing.assert_allclose(denoiser(cubes[part], times[part], edges[part]), whole[part], rtol=0, atol=1e-5)
+
+
+def test_a_sample_of_a_batch_equals_the_sample_alone(denoiser):
+    """Static ranges: what stands beside a cube must not change it, in int8 either."""
+    cubes = make_cubes(4)
+    together = denoiser(cubes, 500, 0.1)
+    for index in range(4):
+        np.testing.assert_allclose(denoiser(cubes[index : index + 1], 500, 0.1)[0], together[index], rtol=0, atol=1e-5)
 
 
 def test_views_are_read_and_inputs_left_alone(denoiser):
@@ -99,13 +114,14 @@ def test_bad_arguments(denoiser, channels, timestep, edge, kind, message):
         denoiser(channels, timestep, edge)
 
 
-def test_bad_files(exported, tmp_path):
-    data, path = exported.onnx.read_bytes(), tmp_path / "bad.onnx"
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_bad_files(precision, precisions, tmp_path):
+    data, path = precisions[precision].read_bytes(), tmp_path / "bad.onnx"
     with pytest.raises(ValueError, match=r"absent\.onnx: no such file"):
         OnnxDenoiser(tmp_path / "absent.onnx")
     with pytest.raises(ValueError, match="no such file"):
         OnnxDenoiser(tmp_path)
-    for length in (0, 10, len(data) // 2, exported.manifest.body_bytes, len(data) - 5):
+    for length in (0, 10, len(data) // 2, read_manifest(precisions[precision]).body_bytes, len(data) - 5):
         path.write_bytes(data[:length])
         with pytest.raises(ValueError, match=r"bad\.onnx: .*truncated"):
             OnnxDenoiser(path)
@@ -117,7 +133,7 @@ def test_bad_files(exported, tmp_path):
     path.write_bytes(b"PK\x03\x04 something else entirely")
     with pytest.raises(ValueError, match="not an unghost ONNX model"):
         OnnxDenoiser(path)
-    model = onnx.load(exported.onnx)
+    model = onnx.load(precisions[precision])
     model.ClearField("metadata_props")
     onnx.save(model, path)
     with pytest.raises(ValueError, match="not an unghost ONNX model"):
@@ -139,6 +155,66 @@ def test_threads_and_providers(exported):
     cubes = make_cubes(1)
     one, two = (OnnxDenoiser(exported.onnx, threads=count)(cubes, 500, 0.1) for count in (1, 2))
     np.testing.assert_allclose(one, two, rtol=0, atol=1e-6)
+
+
+def test_an_unknown_precision_is_refused(exported, tmp_path):
+    data, manifest = exported.onnx.read_bytes(), exported.manifest
+    strange = dataclasses.replace(manifest, training={"export": {"precision": "int3"}})
+    write_sealed(tmp_path / "strange.onnx", data[: manifest.body_bytes], strange)
+    with pytest.raises(ValueError, match="precision must be one of fp32, fp16, int8, got 'int3'"):
+        OnnxDenoiser(tmp_path / "strange.onnx")
+
+
+CUDA, CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
+
+
+@pytest.mark.parametrize(
+    ("asked", "available", "expected"),
+    [
+        (None, [CPU], [CPU]),
+        (None, ["TensorrtExecutionProvider", CUDA, "AzureExecutionProvider", CPU], [CUDA, CPU]),
+        ([CPU], [CUDA, CPU], [CPU]),
+        ([CPU, CUDA], [CUDA, CPU], [CPU, CUDA]),
+    ],
+)
+def test_providers_are_chosen(asked, available, expected):
+    assert choose_providers(asked, available) == expected
+
+
+def test_impossible_providers_are_refused():
+    for asked, available in (([CUDA], [CPU]), (None, ["AzureExecutionProvider"]), ([], [CPU])):
+        with pytest.raises(ValueError, match="are not available, onnxruntime has"):
+            choose_providers(asked, available)
+
+
+def test_cuda_is_asked_for_where_it_is_reported(exported, monkeypatch):
+    """The real path up to the session, which is the real one too, less the provider that is not built in here."""
+    asked, honest = [], onnxruntime.InferenceSession
+
+    def session(data, options, providers):
+        asked.append(list(providers))
+        built_in = onnxruntime.capi._pybind_state.get_available_providers()
+        return honest(data, options, providers=[name for name in providers if name in built_in])
+
+    monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: [CUDA, CPU])
+    monkeypatch.setattr(onnxruntime, "InferenceSession", session)
+    denoiser = OnnxDenoiser(exported.onnx, threads=1)
+    assert asked == [[CUDA, CPU]]
+    assert np.isfinite(denoiser(make_cubes(1), 500, 0.1)).all()
+
+
+@pytest.mark.skipif(CUDA not in onnxruntime.get_available_providers(), reason="onnxruntime without CUDA")
+def test_cuda_gives_the_numbers_of_the_cpu(precisions):
+    for path in precisions.values():
+        fast, plain = OnnxDenoiser(path), OnnxDenoiser(path, providers=[CPU])
+        assert fast.providers[0] == CUDA
+        np.testing.assert_allclose(fast(make_cubes(4), 500, 0.1), plain(make_cubes(4), 500, 0.1), atol=0.02)
+
+
+def test_the_number_of_threads_reaches_the_session(exported):
+    for threads, expected in ((1, 1), (2, 2), (None, 0)):
+        denoiser = OnnxDenoiser(exported.onnx, threads=threads)
+        assert denoiser._session.get_session_options().intra_op_num_threads == expected
 
 
 def test_runs_without_torch_and_onnx(exported):

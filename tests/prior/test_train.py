@@ -2,6 +2,7 @@ import dataclasses
 import json
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -155,6 +156,21 @@ def test_a_killed_process_leaves_a_state_to_go_on_from(tiny_config, shards, tmp_
     assert tensors
 
 
+def test_tensorboard_gets_the_numbers_of_the_log(tiny_config, shards, tmp_path):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    train(dataclasses.replace(tiny_config, steps=20), **shards, out=tmp_path / "run")
+    board = EventAccumulator(str(tmp_path / "run" / "tensorboard"))
+    board.Reload()
+    log = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    for key in ("loss", "gradient_norm", "learning_rate"):
+        found = [(event.step, event.value) for event in board.Scalars(f"train/{key}")]
+        expected = [(line["step"], line[key]) for line in log if line["kind"] == "train"]
+        assert [step for step, _ in found] == [1, 20]
+        assert found == [(step, pytest.approx(value, rel=1e-6)) for step, value in expected]
+    assert [event.step for event in board.Scalars("held/iou")] == [20]
+
+
 def test_divergence_keeps_the_last_good_checkpoint(tiny_config, shards, tmp_path, monkeypatch):
     honest = Mixture.batch
 
@@ -205,6 +221,6 @@ def test_works_without_tensorboard_and_shows_a_bar(tiny_config, shards, tmp_path
     assert result.steps == 2
     assert not (tmp_path / "run" / "tensorboard").exists()
     shown = capsys.readouterr()
-    assert "cubes/s" in shown.err
+    assert re.search(r"\| \d\d:\d\d < (\d\d:\d\d|\?), step 2, loss [\d.]+, \d+ cubes/s", shown.err)  # elapsed < left
     assert shown.out == ""
     assert train_module.MODEL_FILE in {item.name for item in (tmp_path / "run").iterdir()}
