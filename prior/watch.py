@@ -36,8 +36,8 @@ def input_dependence(network: nn.Module) -> float:
     is zero), of order 1 for one that does. The shortcut around the network has no part in it. In float32.
 
     Args:
-        network: called as ``network(channels, timestep, edge_fraction)``; ``config.channels`` says how many channels,
-            or names them.
+        network: called as ``network(channels, timestep, edge_fraction)``; ``config.channels`` names the
+            channels.
 
     Raises:
         ValueError: a network without a 3D convolution.
@@ -51,7 +51,7 @@ def input_dependence(network: nn.Module) -> float:
     device = next(network.parameters()).device
     probes = _probes().to(device)
     channels: Any = network.config.channels  # type: ignore[union-attr]
-    count = channels if isinstance(channels, int) else len(channels)  # a number, or their names
+    count = len(channels)
     others = probes.new_zeros(2, count - 1, *probes.shape[2:])
     times, edges = torch.full((2,), 500, device=device), torch.full((2,), 0.1, device=device)
     try:

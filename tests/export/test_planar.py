@@ -63,7 +63,7 @@ def test_borders_of_the_surroundings_are_padded_alike(corner, make_lively):
     with torch.no_grad():  # the far border matters through the summary alone
         network.context.down.weight.mul_(30.0)
         network.condition[0].weight[:, 18:].mul_(30.0)
-    cubes = np.full((1, 3, 32, 32, 32), LEAST_KNOWN, np.float32)
+    cubes = np.full((1, len(network.config.channels), 32, 32, 32), LEAST_KNOWN, np.float32)
     cubes[:, 0] = -1.0
     dark = (cubes.copy(), np.array([500]), np.array([0.1], np.float32))
     cubes[(0, 1, *(place // 2 * 2 for place in corner))] = 1.0

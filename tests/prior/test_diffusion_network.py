@@ -188,7 +188,7 @@ def test_configuration_chooses_and_refuses():
     with pytest.raises(ValueError, match="objective must be one of"):
         DiffusionConfig("v", TINY)
     with pytest.raises(ValueError, match="network must take signed opacity alone"):
-        DiffusionConfig("x0", dataclasses.replace(TINY, channels=2))
+        DiffusionConfig("x0", dataclasses.replace(TINY, channels=("signed_opacity", "view_count")))
     with pytest.raises(ValueError, match="shortcut is of objective 'epsilon'"):
         DiffusionConfig("x0", TINY, shortcut=True)
     with pytest.raises(ValueError, match=r"unknown keys \['loss'\]"):

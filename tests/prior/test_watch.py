@@ -5,6 +5,7 @@ import pytest
 import torch
 from torch import nn
 
+from unghost.core.channels import CHANNEL_NAMES
 from unghost.denoisers import WEIGHTS
 from unghost.prior.checkpoint import load_model, read_tensors
 from unghost.prior.network import NetworkConfig, RestorationNet
@@ -22,7 +23,7 @@ def fresh(config=TINY):
 
 def test_living_networks_depend_on_their_input():
     assert input_dependence(fresh()) > 1e-2
-    assert input_dependence(fresh(NetworkConfig(channels=3, widths=(8, 8, 8)))) > 1e-2
+    assert input_dependence(fresh(NetworkConfig(channels=CHANNEL_NAMES, widths=(8, 8, 8)))) > 1e-2
     assert input_dependence(load_model(WEIGHTS / "default.safetensors").network) > 0.1
 
 
