@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ..core.aabb import scene_extent
 from ..core.cube_views import count_views
-from ..core.frames import RESOLUTION, CubeFrame, cube_lattices, random_rotations
+from ..core.frames import RESOLUTION, cube_lattices, random_rotations
 from ..core.occupancy import DEFAULT_OPACITY_THRESHOLD, opacity_from_density, opacity_from_signed
 from ..core.shards import (
     TRANSMITTANCE_RESOLUTION,
@@ -39,13 +39,13 @@ from .harvest_config import HarvestConfig
 from .harvest_context import signed_opacity, surroundings
 from .harvest_labels import Labeller, Truth, check_fit, severity_of
 from .harvest_resume import finished, scene_folder
+from .harvest_rooms import draw_objects_of, room_cubes
 
 if TYPE_CHECKING:
     from ..core.sampled_distance import SampledDistance
     from ..fields.kinds import TrainableField
     from ..fields.scenes import PhotographedScene
 
-OBJECT_STREAM = 0x6F626A  # keeps the choice of meshes apart from a scene's own generator
 EARLY = 0.45  # share of the fit at which the first cubes are taken
 TOGETHER, QUERY = 8, 1 << 17  # cubes, and points in them, that are worked on at a time
 
@@ -122,18 +122,6 @@ def _photograph(
     return photograph(rng, random_scene(rng, objects), count=photos, width=width, height=width * 3 // 4)
 
 
-def _draw_objects(
-    seed: int, index: int, config: HarvestConfig, mesh_root: str | Path | None
-) -> tuple[list[SampledDistance], list[dict[str, Any]]]:
-    """The meshes of a scene, drawn apart from all else; none without a folder."""
-    if mesh_root is None:
-        return [], []
-    from .mesh_objects import draw_objects
-
-    rng = np.random.default_rng([seed, index, OBJECT_STREAM])
-    return draw_objects(rng, mesh_root, int(rng.integers(config.objects[0], config.objects[1] + 1)))
-
-
 def _draw_field(rng: np.random.Generator, config: HarvestConfig) -> tuple[str, int, TrainableField]:
     """A fresh field: its kind, its resolution, and itself."""
     from ..fields.kinds import make_field
@@ -157,7 +145,7 @@ def harvest_scene(
     from ..fields.training import TrainingConfig, train_field
 
     rng = np.random.default_rng([seed, index])
-    objects, meshes = _draw_objects(seed, index, config, mesh_root)
+    objects, meshes = draw_objects_of(seed, index, config, mesh_root)
     photographed = _photograph(rng, config, objects)
     kind, resolution, field = _draw_field(rng, config)
     steps = int(np.exp(rng.uniform(*np.log(config.steps))))
@@ -197,40 +185,13 @@ def harvest_scene(
 def room_scene(
     seed: int, index: int, config: HarvestConfig, mesh_root: str | Path | None = None
 ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """Cubes of scene ``index`` as a perfect field would show them, with synthetic corruption; nothing is fitted.
-
-    Whole rooms at the pitch of a field's cells: several things in a cube, thin legs, walls.
-    """
+    """Cubes of scene ``index`` without a field, see :func:`.harvest_rooms.room_cubes`; nothing is fitted."""
     from ..fields.scenes import random_scene
-    from .compose import shell_from_distance
-    from .curate import damage
-    from .recipe import load_recipe
 
-    rng, recipe = np.random.default_rng([seed, index, 1]), load_recipe("rooms")
-    objects, meshes = _draw_objects(seed, index, config, mesh_root)
-    scene, aabb = random_scene(rng, objects), np.array([[-1.0] * 3, [1.0] * 3])
-    count = config.cubes
-    low, high = np.log(config.room_pitch)
-    edges = RESOLUTION * np.exp(rng.uniform(low, high, size=count))
-    candidates = rng.uniform(aabb[0], aabb[1], size=(12 * count, 3))
-    close = np.abs(scene.signed_distance(candidates)) < 0.1
-    centers = np.concatenate([candidates[close], candidates[~close]])[:count]
-    rotations = random_rotations(rng, count)
-    rotations[rng.random(count) >= config.rotated_share] = np.eye(3)
-    pairs = []
-    for center, edge, rotation in zip(centers, edges, rotations):
-        distance = scene.signed_distance(CubeFrame(center, float(edge), rotation).lattice())
-        clean = shell_from_distance(distance, thickness=float(rng.uniform(*recipe.shell_thickness)))
-        clean |= (distance < 0) & (rng.random() < recipe.solid_share)
-        pairs.append(damage(rng, clean, recipe))
-    arrays: dict[str, NDArray[Any]] = {
-        "inputs": quantize_signed(np.stack([signed for signed, _, _ in pairs])),
-        "labels": pack_labels(np.stack([labels for _, labels, _ in pairs])),
-        "severity": np.array([severity for _, _, severity in pairs], dtype=np.float32),
-        "edge_fraction": (edges / scene_extent(aabb)).astype(np.float32),
-        "frames": np.concatenate([centers, edges[:, None], rotations.reshape(count, 9)], axis=1),
-        "group": np.full(count, index, dtype=np.int32),
-    }
+    rng = np.random.default_rng([seed, index, 1])
+    objects, meshes = draw_objects_of(seed, index, config, mesh_root)
+    arrays = room_cubes(rng, random_scene(rng, objects), config)
+    arrays["group"] = np.full(config.cubes, index, dtype=np.int32)
     provenance: dict[str, Any] = {"recipe": "rooms", "seed": seed, "scene": index, "config": dataclasses.asdict(config)}
     licences = sorted({"generated", *(mesh["licence"] for mesh in meshes)})
     return arrays, provenance | {"licence": " AND ".join(licences), "meshes": meshes}

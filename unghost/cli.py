@@ -22,15 +22,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     import tyro
 
-    from . import commands, commands_prior, commands_sample
+    from . import commands, commands_prior, commands_recipes, commands_sample
 
     verbs: dict[str, Callable[..., Any]] = {
         "demo": commands.demo,
         "clean": commands.clean,
         "bench": commands.bench,
-        "curate": commands_prior.curate,
-        "harvest": commands_prior.harvest,
-        "preview": commands_prior.preview,
+        "curate": commands_recipes.curate,
+        "harvest": commands_recipes.harvest,
+        "preview": commands_recipes.preview,
         "train": commands_prior.train,
         "sample": commands_sample.sample,
         "export": commands_prior.export,

@@ -1,6 +1,6 @@
 import pytest
 
-from unghost import commands_prior
+from unghost import commands_recipes
 from unghost.data_recipes import harvest as module
 
 
@@ -13,9 +13,9 @@ def configs(monkeypatch):
 
 
 def test_kinds_and_shares_reach_the_harvest(configs, tmp_path):
-    commands_prior.harvest(tmp_path)
-    commands_prior.harvest(tmp_path, kinds=("mlp",), cubes=7)
-    commands_prior.harvest(tmp_path, kinds=("dense=1", "hash=2.5"))
+    commands_recipes.harvest(tmp_path)
+    commands_recipes.harvest(tmp_path, kinds=("mlp",), cubes=7)
+    commands_recipes.harvest(tmp_path, kinds=("dense=1", "hash=2.5"))
     assert configs[0] == module.HarvestConfig()
     assert configs[0].kinds == ("dense", "hash")
     assert (configs[1].kinds, configs[1].shares, configs[1].cubes) == (("mlp",), (1.0,), 7)
@@ -33,5 +33,5 @@ def test_kinds_and_shares_reach_the_harvest(configs, tmp_path):
 )
 def test_bad_kinds_are_refused(configs, tmp_path, kinds, message):
     with pytest.raises(ValueError, match=message):
-        commands_prior.harvest(tmp_path, kinds=kinds)
+        commands_recipes.harvest(tmp_path, kinds=kinds)
     assert configs == []
