@@ -1,0 +1,153 @@
+"""The reference measurement's parts: classical rivals, scores, the figure's front, the capture's labels."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("scipy")
+pytest.importorskip("torch")
+pytest.importorskip("tyro")
+
+from unghost.core.cameras import Cameras
+from unghost.core.occupancy import FREE_LABEL, IGNORE_LABEL, SURFACE_LABEL
+
+BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
+
+
+@pytest.fixture(scope="module")
+def parts():
+    """The modules of the benchmarks' folder."""
+    sys.path.insert(0, str(BENCHMARKS))
+    try:
+        import capture_cubes
+        import classical
+        import denoise_figure
+        import denoise_scores
+        import denoise_sets
+
+        yield {
+            "classical": classical, "scores": denoise_scores, "sets": denoise_sets, "figure": denoise_figure,
+            "capture": capture_cubes,
+        }  # fmt: skip
+    finally:
+        sys.path.remove(str(BENCHMARKS))
+
+
+def plate(thick=3):
+    cube = np.zeros((32, 32, 32), dtype=bool)
+    cube[4:28, 4:28, 14 : 14 + thick] = True
+    return cube
+
+
+def signed(bits):
+    return np.where(bits, 1.0, -1.0).astype(np.float32)
+
+
+def test_filters_on_a_plate_with_a_speck_and_a_hole(parts):
+    truth = plate()
+    seen = truth.copy()
+    seen[2:4, 2:4, 2:4] = True  # 8 voxels of dust
+    seen[15, 15, 15] = False
+    found = {
+        name: parts["classical"].Classical(name)(signed(seen)[None, None], 900, 0.1)[0, 0] > 0
+        for name in parts["classical"].Classical.names()
+    }
+    np.testing.assert_array_equal(found["input"], seen)
+    for name in ("largest component", "components", "components+closing"):
+        assert not found[name][2:4, 2:4, 2:4].any(), name
+    for name in ("closing", "components+closing"):
+        assert found[name][15, 15, 15], name
+    np.testing.assert_array_equal(found["components+closing"], truth)
+    assert found["opening"].sum() < seen.sum()
+    for name in ("gaussian", "median", "tv"):
+        assert 0.5 < (found[name] & truth).sum() / truth.sum() <= 1.0, name
+
+
+@pytest.mark.parametrize("name", ["largest component", "components", "opening"])
+def test_of_soft_cubes_what_stays_ranks_above_what_goes(parts, name):
+    opacity = np.where(plate(), 0.6, 0.02)
+    opacity[2:4, 2:4, 2:4] = 0.95
+    x0_pred = parts["classical"].Classical(name)((2 * opacity - 1)[None, None].astype(np.float32), 900, 0.1)[0, 0]
+    assert x0_pred[10, 10, 15] > 0 > x0_pred[2, 2, 2]
+    assert x0_pred.min() >= -1
+    assert x0_pred.max() <= 1
+
+
+def test_decided_puts_the_threshold_at_zero_and_keeps_the_order(parts):
+    values = np.linspace(-1, 1, 101, dtype=np.float32)
+    bent = parts["classical"].decided(values)
+    assert bent[0] == -1
+    assert bent[-1] == 1
+    assert parts["classical"].decided(np.float32([-0.8]))[0] == pytest.approx(0, abs=1e-6)
+    assert (np.diff(bent) > 0).all()
+    with pytest.raises(ValueError, match="Classical: name"):
+        parts["classical"].Classical("magic")
+
+
+def test_scores_by_hand(parts):
+    """Two cubes of two groups; ten true voxels, six ghosts, four holes."""
+    labels = np.full((2, 32, 32, 32), FREE_LABEL, dtype=np.uint8)
+    seen = np.full((2, 32, 32, 32), -1.0, dtype=np.float32)
+    x0_pred = np.full((2, 32, 32, 32), -1.0, dtype=np.float32)
+    labels[0, 0, 0, :14] = SURFACE_LABEL
+    seen[0, 0, 0, :10] = 1.0  # ten true, four holes
+    seen[0, 5, 5, :6] = 1.0  # six ghosts
+    labels[1, 3, 3, 3], seen[1, 3, 3, 3] = IGNORE_LABEL, 1.0
+    x0_pred[0, 0, 0, :9] = np.linspace(0.1, 0.9, 9)  # one true voxel lost
+    x0_pred[0, 0, 0, 9] = -0.5
+    x0_pred[0, 0, 0, 10] = 0.5  # one hole filled
+    x0_pred[0, 5, 5, :6] = [-0.9, -0.8, -0.7, -0.6, 0.05, 0.95]
+    row = parts["scores"].score(lambda rows: x0_pred[rows], seen, labels, np.array([0, 1], np.int32), batch=1)
+    assert (row["cubes"], row["groups"], row["true_voxels"], row["ghost_voxels"]) == (2, 2, 10, 6)
+    assert row["floater_recall"] == pytest.approx(4 / 6)
+    assert row["surface_kept"] == pytest.approx(0.9)
+    assert row["holes_filled"] == pytest.approx(0.25)
+    assert row["iou"] == pytest.approx((10 / 16 + 1) / 2)
+    assert row["iou_before"] == pytest.approx((10 / 20 + 1) / 2)
+    assert row["ghosts_removed_98"] == row["ghosts_removed_95"] == pytest.approx(4 / 6)  # all below -0.5
+    assert row["ghosts_removed_90"] == pytest.approx(5 / 6)  # one true voxel may go: those below .1
+    assert row["ghosts_removed_98_per_group"] == row["ghosts_removed_98"]
+
+
+def test_a_set_without_ghosts_has_no_share_of_them(parts):
+    labels = np.full((1, 32, 32, 32), SURFACE_LABEL, dtype=np.uint8)
+    row = parts["scores"].score(
+        lambda rows: np.ones((1, 32, 32, 32)), signed(labels > 0), labels, np.zeros(1, np.int32)
+    )
+    assert row["floater_recall"] is row["ghosts_removed_98"] is row["holes_filled"] is None
+    assert row["surface_kept"] == row["iou"] == 1.0
+
+
+def test_the_front_is_what_nothing_beats_in_both(parts):
+    points = [(100.0, 0.9), (400.0, 0.92), (200.0, 0.95), (800.0, 0.8), (50.0, 0.95)]
+    assert parts["figure"].pareto(points) == [2, 1, 3]
+    assert parts["figure"].pareto([]) == []
+
+
+def test_damage_repeats_and_grows(parts):
+    clean = parts["sets"].CubeSet(
+        "clean", {}, signed(plate())[None], np.where(plate(), SURFACE_LABEL, FREE_LABEL).astype(np.uint8)[None],
+        np.full(1, 0.1, np.float32), np.zeros(1, np.int32),
+    )  # fmt: skip
+    low, again, high = (parts["sets"].damaged(clean, "salt", severity) for severity in (0.1, 0.1, 1.0))
+    np.testing.assert_array_equal(low.signed, again.signed)
+    changed = [(cubes.signed != clean.signed).sum() for cubes in (low, high)]
+    assert 0 < changed[0] < changed[1]
+    assert low.about == {"family": "salt", "severity": 0.1}
+    assert len(clean.first(0)) == 0
+
+
+def test_pseudo_truth_goes_by_the_votes_of_the_photos(parts):
+    """Two cameras look along +x at a wall one unit away; a third one looks elsewhere."""
+    pose = np.array([[0.0, 0.0, -1.0, -1.0], [-1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]])
+    away = pose.copy()
+    away[:, :3] = pose[:, :3] @ np.diag([-1.0, 1.0, -1.0])
+    cameras = Cameras.create(np.stack([pose, pose, away]), np.array([16.0, 16.0, 16.0, 12.0]), 32, 24)
+    depth = np.full((3, 24, 32), 1.0)
+    truth = parts["capture"].PseudoTruth(cameras.select([0]), np.array([[-1.0] * 3, [1.0] * 3]), cameras, depth)
+    places = np.array([[-0.5, 0, 0], [0.0, 0, 0], [0.05, 0, 0], [0.05, 0, 0], [0.5, 0, 0], [-1.5, 0, 0]])
+    opaque = np.array([True, True, True, False, True, True])
+    labels = truth.labels(places, 0.02, opaque)
+    assert labels.tolist() == [FREE_LABEL, SURFACE_LABEL, SURFACE_LABEL, IGNORE_LABEL, IGNORE_LABEL, IGNORE_LABEL]
