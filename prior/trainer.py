@@ -18,6 +18,7 @@ from .diffusion_network import DiffusionNet
 from .diffusion_training import diffusion_losses
 from .distributed import Group
 from .ema import ExponentialMovingAverage
+from .extend import can_extend, extend
 from .networks import AnyNetwork, build_network, network_for
 from .objective import restoration_loss
 
@@ -64,9 +65,12 @@ class Trainer:
         self.started_from: dict[str, Any] | None = None
         if config.init_from:
             start = load_model(config.init_from)
-            if start.network.config != network.config:
+            if start.network.config == network.config:
+                network.load_state_dict(start.network.state_dict())
+            elif can_extend(start.network, network):
+                extend(start.network, network)
+            else:
                 raise ValueError(f"Trainer: init_from {config.init_from} has another network: {start.network.config}")
-            network.load_state_dict(start.network.state_dict())
             kept = ("seed", "steps", "seconds", "batch_size", "learning_rate", "commit", "shards", "started_from")
             digest = hashlib.sha256(Path(config.init_from).read_bytes()).hexdigest()
             earlier = {key: value for key, value in start.manifest.training.items() if key in kept}
