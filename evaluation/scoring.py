@@ -69,6 +69,7 @@ def score_scene(
     extent: SceneExtent,
     *,
     convention: str,
+    within: Mask | None = None,
     network: Lpips | None = None,
     keys: Iterable[str] | None = None,
     pixels_per_degree: float = metrics.PIXELS_PER_DEGREE,
@@ -80,6 +81,8 @@ def score_scene(
         truth: of the same views.
         extent: :meth:`SceneExtent.of` both trajectories.
         convention: a key of ``CONVENTIONS``.
+        within: ``(n, H, W)`` bool, only these of the convention's pixels count: those of
+            :func:`unghost.evaluation.curves.cut_to_coverage`, or that all compared methods have.
         network: of :func:`unghost.evaluation.perceptual.load_lpips`; without it LPIPS is None and noted.
         keys: metrics to compute, of those the convention defines; None: all that the maps allow, the others None and
             noted. A metric that is *asked for* without its maps is an error.
@@ -92,6 +95,12 @@ def score_scene(
     rule = get_convention(convention)
     check_match("score_scene", renders, truth)
     masks = evaluation_masks(rule, renders, truth, extent)
+    if within is not None:
+        if within.dtype != np.bool_ or within.shape != masks.shape:
+            raise ValueError(
+                f"score_scene: within must be bool of shape {masks.shape}, got {within.dtype} {within.shape}"
+            )
+        masks &= within
     notes = _absent(rule, renders, truth, network)
     wanted = rule.keys if keys is None else tuple(keys)
     for key in wanted if keys is not None else ():
