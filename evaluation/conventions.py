@@ -1,7 +1,7 @@
 """Every published way to score the two-trajectory protocol, by name.
 
-Scores of two of them differ by decibels on the very same renders (``docs/results`` has the table), so that a row
-carries its convention and nothing puts two of them into one column.
+Scores of two of them differ by decibels on the very same renders (:func:`unghost.evaluation.report.format_conventions`
+prints by how much), so that a row carries its convention and nothing puts two of them into one column.
 """
 
 from __future__ import annotations

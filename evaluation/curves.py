@@ -74,7 +74,11 @@ class Curve:
         """
         convention = one_convention("Curve.create", rows)
         triples = [(row.get("coverage"), row.get(metric), np.nan if knob is None else row[knob]) for row in rows]
-        known = [(float(c), float(s), float(k)) for c, s, k in triples if _finite(c) and _finite(s)]
+        known = [
+            (float(c), float(s), float(k))
+            for c, s, k in triples
+            if c is not None and s is not None and np.isfinite(c) and np.isfinite(s)
+        ]
         if not known:
             raise ValueError(f"Curve.create: {method!r} has no row with a finite {metric} and coverage")
         outside = [c for c, _, _ in known if not 0 <= c <= 1]
@@ -86,8 +90,9 @@ class Curve:
             if kept and each[0] - kept[-1][0] <= SAME:
                 kept.pop()
             kept.append(each)
-        columns = np.array(kept, dtype=np.float64).T
-        return cls(method, str(convention), metric, *columns, higher_is_better, len(rows) - len(known))
+        places, scores, knobs = np.array(kept, dtype=np.float64).T
+        undefined = len(rows) - len(known)
+        return cls(method, str(convention), metric, places, scores, knobs, higher_is_better, undefined)
 
     @property
     def is_point(self) -> bool:
@@ -216,10 +221,6 @@ def cut_to_coverage(mask: Mask, confidence: NDArray[Any], *, coverage: float) ->
     kept = np.zeros(mask.size, dtype=np.bool_)
     kept[candidates[np.argsort(-sureness, kind="stable")[:keep]]] = True
     return kept.reshape(mask.shape)
-
-
-def _finite(value: Any) -> bool:
-    return value is not None and bool(np.isfinite(value))
 
 
 def _comparable(caller: str, curves: Sequence[Curve]) -> None:

@@ -174,14 +174,7 @@ def load_pseudo_truth(
     source = Path(path)
     manifest, arrays = _read(source)
     try:
-        sizes = {side: [int(each) for each in manifest[f"{side}_size"]] for side in ("eval", "train")}
-        lenses = {
-            side: Cameras.create(
-                arrays.pop(f"{side}_camera_to_world"), arrays.pop(f"{side}_intrinsics"), *sizes[side],
-                arrays.pop(f"{side}_distortion"),
-            )
-            for side in ("eval", "train")
-        }  # fmt: skip
+        lenses = {side: _cameras(side, manifest, arrays) for side in ("eval", "train")}
         result = PseudoTruth(
             lenses["eval"], lenses["train"], arrays["depth"], arrays["normals"], arrays["seen_frustum"],
             arrays.get("seen_open"), manifest["tolerance"], tuple(manifest["names"]), dict(manifest["details"]),
@@ -232,6 +225,12 @@ def _read(source: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         if values.dtype != _dtype(name) or _digest(values) != hashes[name]:
             raise ValueError(f"{caller}: {source} was altered: {name} does not match its hash or is no {_dtype(name)}")
     return manifest, arrays
+
+
+def _cameras(side: str, manifest: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Cameras:
+    poses, intrinsics, distortion = (arrays[f"{side}_{name}"] for name in LENSES)
+    width, height = (int(each) for each in manifest[f"{side}_size"])
+    return Cameras.create(poses, intrinsics, width, height, distortion)
 
 
 def _check(caller: str, maps: PseudoTruth) -> None:

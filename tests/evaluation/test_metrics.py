@@ -104,67 +104,6 @@ def test_ssim_conventions_differ_as_documented():
     assert metrics.ssim(other, target, mask, data_range=1.0, convention="premasked") == pytest.approx(leaky)
 
 
-def test_depth_and_disparity_known_values():
-    preds = np.array([[1.0, 2.0], [4.0, np.inf]])
-    target = np.array([[2.0, 2.0], [1.0, np.inf]])
-    mask = np.array([[True, True], [True, False]])
-    assert metrics.depth_mse(preds, target, mask) == pytest.approx((1 + 0 + 9) / 3)
-    assert metrics.disparity_mae(preds, target, mask) == pytest.approx((0.5 + 0 + 0.75) / 3)
-    assert metrics.disparity_mae(preds, target, np.ones((2, 2), dtype=bool)) == pytest.approx(1.25 / 4)
-    with pytest.raises(ValueError, match="must be > 0"):
-        metrics.disparity_mae(preds - 1, target, mask)
-
-
-def test_backprojection_lands_on_the_plane_it_came_from():
-    camera = _camera()
-    _, directions = camera.rays(0)
-    depth = 3.0 / -directions[..., 2]  # the plane z = -3, as distance along unit rays
-    positions = metrics.backproject(depth, camera, 0)
-    np.testing.assert_allclose(positions[..., 2], -3.0, atol=1e-12)
-    depth[2, 3] = np.inf
-    assert np.isnan(metrics.backproject(depth, camera, 0)[2, 3]).all()
-
-
-@pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.3, -0.4, 0.8), (-0.6, 0.1, 0.5)])
-def test_normals_of_a_tilted_plane_are_exact_and_face_the_camera(normal):
-    unit = np.array(normal) / np.linalg.norm(normal)
-    camera = _camera()
-    _, directions = camera.rays(0)
-    depth = -2.0 / (directions @ unit)  # unit . (d t) = -2
-    assert (depth > 0).all()
-    normals = metrics.normals_from_depth(depth, camera, 0)
-    np.testing.assert_allclose(normals, np.broadcast_to(unit, normals.shape), atol=1e-9)
-
-
-def test_normals_turn_with_the_camera():
-    turn = np.array([[0.0, 0.0, 1.0, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])
-    camera = _camera(pose=turn[None])
-    _, directions = _camera().rays(0)
-    normals = metrics.normals_from_depth(3.0 / -directions[..., 2], camera, 0)
-    np.testing.assert_allclose(normals, np.broadcast_to(turn[:3, 2], normals.shape), atol=1e-9)
-
-
-def test_normals_are_missing_beside_a_hole():
-    camera = _camera()
-    depth = np.full((24, 30), 2.0)
-    depth[10, 10] = np.inf
-    missing = np.isnan(metrics.normals_from_depth(depth, camera, 0)).any(axis=-1)
-    assert sorted(map(tuple, np.argwhere(missing))) == [(9, 10), (10, 9), (10, 10), (10, 11), (11, 10)]
-
-
-def test_normal_errors_known_values():
-    angles = np.radians([[0.0, 20.0, 40.0], [180.0, 0.0, 0.0]])
-    preds = np.stack([np.sin(angles), np.zeros_like(angles), np.cos(angles)], axis=-1)
-    target = np.zeros_like(preds)
-    target[..., 2] = 1
-    target[1, 1] = np.nan
-    mask = np.array([[True, True, True], [True, True, False]])
-    found = metrics.normal_errors(preds, target, mask)  # 0, 20, 40, 180
-    assert found["normal_mean_deg"] == pytest.approx(60)
-    assert found["normal_median_deg"] == pytest.approx(30)
-    assert found["normal_pct_30"] == pytest.approx(0.5)
-
-
 def test_an_empty_mask_gives_nan_everywhere():
     preds, target = _pair()
     empty = np.zeros_like(FULL)
