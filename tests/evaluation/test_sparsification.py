@@ -113,3 +113,20 @@ def test_errors_are_named():
         ause(good, np.array([1.0, np.nan, 1, 1]))
     with pytest.raises(ValueError, match="steps must be >= 2, got 1"):
         ause(good, good, steps=1)
+
+
+@pytest.mark.parametrize("reduction", ["mae", "mse", "rmse"])
+def test_without_ties_the_published_recipe_gives_the_same_area(reduction):
+    # Bayes' Rays: a hundred shares removed, means of the prefixes of both orders, divided by the larger maximum
+    rng = np.random.default_rng(0)
+    errors = rng.exponential(size=1003)
+    doubts = errors + rng.normal(size=1003)
+    values = errors if reduction == "mae" else errors**2
+    removed = np.linspace(0, 1, 100, endpoint=False)
+    curves = []
+    for ordered in (values[np.argsort(doubts)], np.sort(values)):
+        means = np.array([ordered[: int((1 - share) * 1003)].mean() for share in removed])
+        curves.append(np.sqrt(means) if reduction == "rmse" else means)
+    apart = (curves[0] - curves[1]) / max(curves[0].max(), curves[1].max())
+    wanted = ((apart[1:] + apart[:-1]) / 2 * np.diff(removed)).sum()
+    assert ause(errors, doubts, reduction=reduction, normalization="largest") == pytest.approx(wanted)
