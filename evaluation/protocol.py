@@ -50,6 +50,29 @@ def visibility_masks(
 ) -> Mask:
     """Which evaluation pixels show something that the training cameras saw.
 
+    Args:
+        eval_cameras, pseudo_depth, train_cameras, train_depth, tolerance: of :func:`view_counts`.
+        minimum_views: how many must see the point.
+
+    Returns:
+        ``(n, H, W)`` bool.
+    """
+    if minimum_views < 1:
+        raise ValueError(f"visibility_masks: minimum_views must be >= 1, got {minimum_views}")
+    counts = view_counts(eval_cameras, pseudo_depth, train_cameras, train_depth=train_depth, tolerance=tolerance)
+    return np.asarray(counts >= minimum_views, dtype=np.bool_)
+
+
+def view_counts(
+    eval_cameras: Cameras,
+    pseudo_depth: NDArray[Any],
+    train_cameras: Cameras,
+    *,
+    train_depth: NDArray[Any] | None = None,
+    tolerance: float = 0.05,
+) -> NDArray[np.int64]:
+    """How many training cameras see what each evaluation pixel shows.
+
     Every pixel is back-projected (origin + depth * unit direction, lens honoured) and the training
     cameras whose frustum holds the point are counted: the paper's test.
 
@@ -58,27 +81,23 @@ def visibility_masks(
         pseudo_depth: ``(n, H, W)`` distance along the unit ray, scene units, > 0; not clipped here, as the
             question is a geometric one; inf (no surface) is taken to be far away.
         train_cameras: ``m`` cameras.
-        minimum_views: how many must see the point.
         train_depth: ``(m, h, w)`` distance along the unit rays of the *training* cameras, inf for nothing:
             makes the test occlusion-aware (a departure from the paper).
         tolerance: relative tolerance of that test.
 
     Returns:
-        ``(n, H, W)`` bool.
+        ``(n, H, W)``, 0 to ``m``.
     """
-    depth = _depths("visibility_masks", pseudo_depth, eval_cameras, "pseudo_depth")
-    if minimum_views < 1:
-        raise ValueError(f"visibility_masks: minimum_views must be >= 1, got {minimum_views}")
+    depth = _depths("view_counts", pseudo_depth, eval_cameras, "pseudo_depth")
     optical = None
     if train_depth is not None:
-        optical = optical_depth(_depths("visibility_masks", train_depth, train_cameras, "train_depth"), train_cameras)
+        optical = optical_depth(_depths("view_counts", train_depth, train_cameras, "train_depth"), train_cameras)
     far = FAR * depth_limit(train_cameras, eval_cameras)
-    masks = np.zeros(depth.shape, dtype=bool)
+    counts = np.zeros(depth.shape, dtype=np.int64)
     for index in range(len(eval_cameras)):
         points = metrics.backproject(np.minimum(depth[index], far), eval_cameras, index)
-        seen = train_cameras.view_count(points, depth_maps=optical, tolerance=tolerance)
-        masks[index] = seen >= minimum_views
-    return masks
+        counts[index] = train_cameras.view_count(points, depth_maps=optical, tolerance=tolerance)
+    return counts
 
 
 def depth_masks(depth: NDArray[Any], limit: float) -> Mask:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .conventions import CONVENTIONS, one_convention
 from .protocol import json_ready
 
 TABLE_KEYS = (
@@ -34,11 +35,7 @@ def mean_over_seeds(method: str, per_seed: Sequence[Mapping[str, Any]]) -> dict[
     keys = list(per_seed[0])
     if any(set(scores) != set(keys) for scores in per_seed):
         raise ValueError("mean_over_seeds: every seed must have the same keys")
-    conventions = {scores.get("convention") for scores in per_seed}
-    if len(conventions) > 1:
-        raise ValueError(
-            f"mean_over_seeds: scores of different conventions do not mix: {sorted(map(str, conventions))}"
-        )
+    one_convention("mean_over_seeds", per_seed)
     row: dict[str, Any] = {"method": method}
     for key in keys:
         if key == "convention":
@@ -53,14 +50,56 @@ def format_table(rows: Sequence[Mapping[str, Any]], keys: Sequence[str] = TABLE_
     """Rows as aligned text, one method a line; a dash where there is no number.
 
     Raises:
-        ValueError: rows of different conventions.
+        ValueError: rows of different conventions (both named): see :func:`format_conventions` for those.
     """
-    if len({row.get("convention") for row in rows}) > 1:
-        raise ValueError("format_table: rows of different conventions must not stand in one table")
+    one_convention("format_table", rows)
     cells = [["method", *keys]]
     for row in rows:
         values = [row.get(key) for key in keys]
-        cells.append([str(row["method"]), *["–" if value is None else f"{value:.3f}" for value in values]])
+        cells.append([str(row["method"]), *map(_number, values)])
+    return _aligned(cells)
+
+
+def convention_rows(scores: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """The same renders under several conventions: a row a metric, a column a convention, and how far they differ.
+
+    Args:
+        scores: convention -> its scores of one and the same renders (:meth:`SceneScores.means` or a row of
+            :func:`unghost.evaluation.scoring.summarize`).
+
+    Returns:
+        Rows ``{"metric", <convention>: value or None, …, "spread"}``, ``spread`` being the largest finite value less
+        the smallest, None with fewer than two.
+
+    Raises:
+        ValueError: scores stand under another convention's name (both named).
+    """
+    for name, each in scores.items():
+        if each.get("convention", name) != name:
+            raise ValueError(f"convention_rows: the scores given as {name!r} are of {each['convention']!r}")
+    keys = dict.fromkeys(key for name in scores if name in CONVENTIONS for key in CONVENTIONS[name].keys)
+    rows = []
+    for key in keys:
+        values = {name: each.get(key) for name, each in scores.items()}
+        finite = [float(value) for value in values.values() if value is not None and np.isfinite(value)]
+        spread = max(finite) - min(finite) if len(finite) > 1 else None
+        rows.append({"metric": key, **values, "spread": spread})
+    return rows
+
+
+def format_conventions(scores: Mapping[str, Mapping[str, Any]]) -> str:
+    """:func:`convention_rows` as aligned text; a dash where a convention does not define a metric."""
+    cells = [["metric", *scores, "spread"]]
+    for row in convention_rows(scores):
+        cells.append([row["metric"], *(_number(row[name]) for name in scores), _number(row["spread"])])
+    return _aligned(cells)
+
+
+def _number(value: Any) -> str:
+    return "–" if value is None else f"{value:.3f}"
+
+
+def _aligned(cells: Sequence[Sequence[str]]) -> str:
     widths = [max(len(line[column]) for line in cells) for column in range(len(cells[0]))]
     lines = ["  ".join(cell.rjust(width) for cell, width in zip(line, widths)).rstrip() for line in cells]
     return "\n".join(lines)

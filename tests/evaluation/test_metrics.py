@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from skimage.metrics import structural_similarity
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from unghost.core.cameras import Cameras
 from unghost.evaluation import metrics
@@ -104,67 +104,6 @@ def test_ssim_conventions_differ_as_documented():
     assert metrics.ssim(other, target, mask, data_range=1.0, convention="premasked") == pytest.approx(leaky)
 
 
-def test_depth_and_disparity_known_values():
-    preds = np.array([[1.0, 2.0], [4.0, np.inf]])
-    target = np.array([[2.0, 2.0], [1.0, np.inf]])
-    mask = np.array([[True, True], [True, False]])
-    assert metrics.depth_mse(preds, target, mask) == pytest.approx((1 + 0 + 9) / 3)
-    assert metrics.disparity_mae(preds, target, mask) == pytest.approx((0.5 + 0 + 0.75) / 3)
-    assert metrics.disparity_mae(preds, target, np.ones((2, 2), dtype=bool)) == pytest.approx(1.25 / 4)
-    with pytest.raises(ValueError, match="must be > 0"):
-        metrics.disparity_mae(preds - 1, target, mask)
-
-
-def test_backprojection_lands_on_the_plane_it_came_from():
-    camera = _camera()
-    _, directions = camera.rays(0)
-    depth = 3.0 / -directions[..., 2]  # the plane z = -3, as distance along unit rays
-    positions = metrics.backproject(depth, camera, 0)
-    np.testing.assert_allclose(positions[..., 2], -3.0, atol=1e-12)
-    depth[2, 3] = np.inf
-    assert np.isnan(metrics.backproject(depth, camera, 0)[2, 3]).all()
-
-
-@pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.3, -0.4, 0.8), (-0.6, 0.1, 0.5)])
-def test_normals_of_a_tilted_plane_are_exact_and_face_the_camera(normal):
-    unit = np.array(normal) / np.linalg.norm(normal)
-    camera = _camera()
-    _, directions = camera.rays(0)
-    depth = -2.0 / (directions @ unit)  # unit . (d t) = -2
-    assert (depth > 0).all()
-    normals = metrics.normals_from_depth(depth, camera, 0)
-    np.testing.assert_allclose(normals, np.broadcast_to(unit, normals.shape), atol=1e-9)
-
-
-def test_normals_turn_with_the_camera():
-    turn = np.array([[0.0, 0.0, 1.0, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])
-    camera = _camera(pose=turn[None])
-    _, directions = _camera().rays(0)
-    normals = metrics.normals_from_depth(3.0 / -directions[..., 2], camera, 0)
-    np.testing.assert_allclose(normals, np.broadcast_to(turn[:3, 2], normals.shape), atol=1e-9)
-
-
-def test_normals_are_missing_beside_a_hole():
-    camera = _camera()
-    depth = np.full((24, 30), 2.0)
-    depth[10, 10] = np.inf
-    missing = np.isnan(metrics.normals_from_depth(depth, camera, 0)).any(axis=-1)
-    assert sorted(map(tuple, np.argwhere(missing))) == [(9, 10), (10, 9), (10, 10), (10, 11), (11, 10)]
-
-
-def test_normal_errors_known_values():
-    angles = np.radians([[0.0, 20.0, 40.0], [180.0, 0.0, 0.0]])
-    preds = np.stack([np.sin(angles), np.zeros_like(angles), np.cos(angles)], axis=-1)
-    target = np.zeros_like(preds)
-    target[..., 2] = 1
-    target[1, 1] = np.nan
-    mask = np.array([[True, True, True], [True, True, False]])
-    found = metrics.normal_errors(preds, target, mask)  # 0, 20, 40, 180
-    assert found["normal_mean_deg"] == pytest.approx(60)
-    assert found["normal_median_deg"] == pytest.approx(30)
-    assert found["normal_pct_30"] == pytest.approx(0.5)
-
-
 def test_an_empty_mask_gives_nan_everywhere():
     preds, target = _pair()
     empty = np.zeros_like(FULL)
@@ -197,7 +136,9 @@ def test_errors_name_function_argument_and_rule():
         metrics.ssim(preds, target, FULL.astype(float), data_range=1.0)
     with pytest.raises(ValueError, match="data_range must be finite and > 0, got 0"):
         metrics.psnr(preds, target, FULL, data_range=0)
-    with pytest.raises(ValueError, match="convention must be one of map_mean, premasked, got 'best'"):
+    with pytest.raises(
+        ValueError, match=r"convention must be one of map_mean, premasked, premasked_over_mask, .* got 'best'"
+    ):
         metrics.ssim(preds, target, FULL, data_range=1.0, convention="best")
     with pytest.raises(ValueError, match=r"backproject: depth must have shape \(24, 30\)"):
         metrics.backproject(np.ones((30, 24)), _camera(), 0)
@@ -211,3 +152,50 @@ def test_inputs_are_left_alone():
     metrics.normals_from_depth(preds[..., 0], _camera(), 0)
     np.testing.assert_array_equal(preds, copies[0])
     np.testing.assert_array_equal(target, copies[1])
+
+
+def test_psnr_conventions_by_hand():
+    # errors .1, .2, .4 in the three channels of half the pixels: MSE .01, .04, .16 are 20, 13.979 and 7.959 dB, their
+    # mean 13.979 dB; pooled MSE .07 is 11.549 dB; over all pixels .035 is 14.559 dB, 3.0103 dB = 10 log10(2) above
+    target = np.zeros((4, 6, 3))
+    preds = target + np.array([0.1, 0.2, 0.4])
+    mask = np.zeros((4, 6), dtype=bool)
+    mask[:, :3] = True
+    found = {
+        name: metrics.psnr(preds, target, mask, data_range=1.0, convention=name) for name in metrics.PSNR_CONVENTIONS
+    }
+    assert found == {
+        "pooled": pytest.approx(11.5490, abs=1e-4),
+        "per_channel": pytest.approx(13.9794, abs=1e-4),
+        "all_pixels": pytest.approx(11.5490 + 10 * np.log10(2), abs=1e-4),
+    }
+    with pytest.raises(ValueError, match="convention must be one of pooled, per_channel, all_pixels, got 'masked'"):
+        metrics.psnr(preds, target, mask, data_range=1.0, convention="masked")
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10**6), st.floats(0.05, 0.95))
+def test_psnr_conventions_stand_in_their_order(seed, share):
+    preds, target = _pair(seed)
+    mask = np.random.default_rng(seed).random(FULL.shape) < share
+    mask[0, 0] = True
+    pooled, per_channel, all_pixels = (
+        metrics.psnr(preds, target, mask, data_range=1.0, convention=name) for name in metrics.PSNR_CONVENTIONS
+    )
+    assert per_channel >= pooled - 1e-12
+    assert all_pixels == pytest.approx(pooled + 10 * np.log10(1 / mask.mean()))
+
+
+def test_psnr_is_scikit_images():
+    preds, target = _pair()
+    mask = np.random.default_rng(2).random(FULL.shape) < 0.5
+    oracle = peak_signal_noise_ratio(target[mask], preds[mask], data_range=1.0)
+    assert metrics.psnr(preds, target, mask, data_range=1.0) == pytest.approx(oracle, abs=1e-12)
+
+
+def test_one_equal_channel_makes_the_channels_mean_infinite():
+    target = np.zeros((3, 3, 3))
+    mask = np.ones((3, 3), dtype=bool)
+    assert metrics.psnr(
+        target + np.array([0, 0.1, 0.1]), target, mask, data_range=1.0, convention="per_channel"
+    ) == float("inf")

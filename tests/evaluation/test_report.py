@@ -78,3 +78,33 @@ def test_without_matplotlib_the_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(ImportError, match=r"pip install unghost\[eval\]"):
         report.draw_comparison(tmp_path / "a.png", {}, views=[0], limit=1.0, title="t")
+
+
+def test_the_refusal_names_both_conventions_and_rows():
+    rows = [{"method": "field", "convention": "proper"}, {"method": "dsds", "convention": "paper_code"}]
+    with pytest.raises(
+        ValueError, match=r"'proper' \(row 'field'\) and 'paper_code' \(row 'dsds'\) must not stand in one"
+    ):
+        report.format_table(rows)
+    with pytest.raises(ValueError, match=r"None \(row 'field'\) and 'proper' \(row 'dsds'\)"):
+        report.format_table([{"method": "field"}, {"method": "dsds", "convention": "proper"}])
+
+
+def test_conventions_stand_side_by_side_in_a_column_each():
+    scores = {
+        "proper": {"convention": "proper", "psnr": 17.0, "ssim": 0.5, "coverage": 0.6},
+        "nerfbaselines": {"convention": "nerfbaselines", "psnr": 19.0, "ssim": 0.75},
+        "paper_code": {"convention": "paper_code", "psnr": float("inf"), "ssim": None, "coverage": 0.8},
+    }
+    rows = {row["metric"]: row for row in report.convention_rows(scores)}
+    assert rows["psnr"]["spread"] == 2.0  # infinity is no distance
+    assert rows["ssim"] == {"metric": "ssim", "proper": 0.5, "nerfbaselines": 0.75, "paper_code": None, "spread": 0.25}
+    assert rows["coverage"]["nerfbaselines"] is None
+    assert rows["coverage"]["spread"] == pytest.approx(0.2)
+    assert rows["flip"]["spread"] is None
+    lines = [line.split() for line in report.format_conventions(scores).splitlines()]
+    assert lines[0] == ["metric", "proper", "nerfbaselines", "paper_code", "spread"]
+    assert lines[1] == ["psnr", "17.000", "19.000", "inf", "2.000"]
+    assert ["coverage", "0.600", "–", "0.800", "0.200"] in lines
+    with pytest.raises(ValueError, match="given as 'proper' are of 'paper_code'"):
+        report.convention_rows({"proper": scores["paper_code"]})

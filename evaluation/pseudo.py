@@ -1,0 +1,289 @@
+"""Pseudo ground truth of the evaluation views: depth, normals and visibility, made once, stored, and reused.
+
+The depth comes from the caller: rendered by a field trained on both trajectories, or exact for a synthetic scene.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import zipfile
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.cameras import Cameras
+from .checks import Mask
+from .conventions import SceneExtent
+from .geometry import normals_from_depth
+from .protocol import view_counts
+from .views import Truth, check_depth
+
+FORMAT = "unghost-pseudo-gt"
+FORMAT_VERSION = 1
+MAPS = {"depth": "<f4", "normals": "<f4", "seen_frustum": "<u2", "seen_open": "<u2"}
+LENSES = {"camera_to_world": (3, 4), "intrinsics": (4,), "distortion": (6,)}
+SAME_CAMERA = 1e-6  # relative: cameras that went through a text file are still the same
+
+
+@dataclass(frozen=True, eq=False)
+class PseudoTruth:
+    """Maps of ``n`` evaluation views of one scene.
+
+    Attributes:
+        eval_cameras, train_cameras: of the two trajectories; ``n`` and ``m`` of them.
+        depth: ``(n, H, W)`` float32 along the unit ray, scene units, > 0, inf for no surface.
+        normals: ``(n, H, W, 3)`` float32 unit, world axes, NaN where there is none.
+        seen_frustum: ``(n, H, W)`` uint16, training cameras whose frustum holds the point: the paper's count.
+        seen_open: the same, of those from which nothing hides it; None if no training depth was given.
+        tolerance: relative depth tolerance of ``seen_open``; None without it.
+        names: of the views.
+        details: JSON-able provenance: which field or scene, its settings, its commit.
+    """
+
+    eval_cameras: Cameras
+    train_cameras: Cameras
+    depth: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    seen_frustum: NDArray[np.uint16]
+    seen_open: NDArray[np.uint16] | None
+    tolerance: float | None
+    names: tuple[str, ...]
+    details: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def extent(self) -> SceneExtent:
+        """The scene's lengths; ``extent.limit`` is twice the largest distance between two cameras."""
+        return SceneExtent.of(self.train_cameras, self.eval_cameras)
+
+    def visible(self, *, occlusion: bool, minimum_views: int = 1) -> Mask:
+        """``(n, H, W)`` bool: pixels that at least ``minimum_views`` training cameras see.
+
+        Args:
+            occlusion: count only cameras from which nothing hides the point. False is the paper's test.
+            minimum_views: >= 1.
+
+        Raises:
+            ValueError: ``minimum_views < 1``, or occlusion asked of maps that were made without training depth.
+        """
+        if minimum_views < 1:
+            raise ValueError(f"PseudoTruth.visible: minimum_views must be >= 1, got {minimum_views}")
+        if occlusion and self.seen_open is None:
+            raise ValueError("PseudoTruth.visible: occlusion needs maps made with train_depth; these were not")
+        counts = self.seen_open if occlusion and self.seen_open is not None else self.seen_frustum
+        return np.asarray(counts >= minimum_views, dtype=np.bool_)
+
+    def truth(self, photos: NDArray[Any], *, occlusion: bool, minimum_views: int = 1) -> Truth:
+        """What renders are scored against: the photos ``(n, H, W, 3)`` and these maps."""
+        visible = self.visible(occlusion=occlusion, minimum_views=minimum_views)
+        return Truth(photos, visible, self.depth, self.normals, self.eval_cameras, self.names)
+
+    def save(self, path: str | Path) -> None:
+        """Write ``.npz`` without pickles, whole or not at all (``docs/formats.md``)."""
+        arrays = {name: getattr(self, name) for name in MAPS if getattr(self, name) is not None}
+        for side, cameras in (("eval", self.eval_cameras), ("train", self.train_cameras)):
+            arrays |= {f"{side}_{name}": getattr(cameras, name) for name in LENSES}
+        arrays = {name: np.ascontiguousarray(values, dtype=_dtype(name)) for name, values in arrays.items()}
+        manifest = {
+            "format": FORMAT, "format_version": FORMAT_VERSION, "names": list(self.names),
+            "eval_size": [self.eval_cameras.width, self.eval_cameras.height],
+            "train_size": [self.train_cameras.width, self.train_cameras.height],
+            "depth_limit": self.extent.limit, "tolerance": self.tolerance,
+            "sha256": {name: _digest(values) for name, values in arrays.items()}, "details": dict(self.details),
+        }  # fmt: skip
+        target = Path(path)
+        partial = target.with_name(target.name + ".partial")
+        try:
+            text = np.frombuffer(json.dumps(manifest, allow_nan=False).encode(), dtype=np.uint8)
+            with partial.open("wb") as stream:
+                np.savez_compressed(stream, manifest=text, **arrays)
+            os.replace(partial, target)
+        finally:
+            partial.unlink(missing_ok=True)
+
+
+def make_pseudo_truth(
+    eval_cameras: Cameras,
+    train_cameras: Cameras,
+    depth: NDArray[Any],
+    *,
+    normals: NDArray[Any] | None = None,
+    train_depth: NDArray[Any] | None = None,
+    tolerance: float = 0.05,
+    names: Sequence[str] = (),
+    details: Mapping[str, Any] | None = None,
+) -> PseudoTruth:
+    """Normals and visibility of the evaluation views from their depth.
+
+    Args:
+        eval_cameras: ``n`` cameras; ``train_cameras``: ``m``. Together at least two distinct origins.
+        train_cameras: see above.
+        depth: ``(n, H, W)`` along the unit ray, scene units, > 0, inf for no surface.
+        normals: ``(n, H, W, 3)`` unit, world axes, NaN for none; None: from the depth.
+        train_depth: ``(m, h, w)`` of the training views, for occlusion-aware visibility.
+        tolerance: relative depth tolerance of that.
+        names: of the views; ``0``, ``1``, … unless given.
+        details: JSON-able provenance, stored.
+
+    Raises:
+        ValueError: shapes, depth that is NaN or not > 0 (counted), normals that are not unit vectors, names that are
+            not ``n`` different ones, details that are not JSON.
+    """
+    frustum = view_counts(eval_cameras, depth, train_cameras)
+    hidden = None
+    if train_depth is not None:
+        hidden = view_counts(eval_cameras, depth, train_cameras, train_depth=train_depth, tolerance=tolerance)
+    single = np.asarray(depth, dtype=np.float32)
+    if normals is None:
+        exact = np.asarray(depth, dtype=np.float64)
+        normals = np.stack([normals_from_depth(exact[i], eval_cameras, i) for i in range(len(eval_cameras))])
+    labels = tuple(names) or tuple(str(index) for index in range(len(eval_cameras)))
+    try:
+        json.dumps(dict(details or {}), allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"make_pseudo_truth: details must be JSON without NaN ({error})") from None
+    result = PseudoTruth(
+        eval_cameras, train_cameras, single, np.asarray(normals, dtype=np.float32), _counts(frustum),
+        None if hidden is None else _counts(hidden), None if hidden is None else float(tolerance), labels,
+        dict(details or {}),
+    )  # fmt: skip
+    _check("make_pseudo_truth", result)
+    return result
+
+
+def load_pseudo_truth(
+    path: str | Path, *, eval_cameras: Cameras | None = None, train_cameras: Cameras | None = None
+) -> PseudoTruth:
+    """Read what :meth:`PseudoTruth.save` wrote.
+
+    Args:
+        path: of the file.
+        eval_cameras, train_cameras: if given, the file must be of these cameras: size, poses, intrinsics and
+            distortion equal to a millionth.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: a foreign, truncated, altered or inconsistent file, or one of other cameras; the message names it.
+    """
+    source = Path(path)
+    manifest, arrays = _read(source)
+    try:
+        lenses = {side: _cameras(side, manifest, arrays) for side in ("eval", "train")}
+        result = PseudoTruth(
+            lenses["eval"], lenses["train"], arrays["depth"], arrays["normals"], arrays["seen_frustum"],
+            arrays.get("seen_open"), manifest["tolerance"], tuple(manifest["names"]), dict(manifest["details"]),
+        )  # fmt: skip
+        _check("load_pseudo_truth", result)
+        stated = float(manifest["depth_limit"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"load_pseudo_truth: {source} is inconsistent: {error}") from None
+    if not np.isclose(stated, result.extent.limit, rtol=1e-9):
+        raise ValueError(
+            f"load_pseudo_truth: {source} is inconsistent: depth_limit {stated} for cameras of {result.extent.limit}"
+        )
+    for side, wanted in (("eval", eval_cameras), ("train", train_cameras)):
+        if wanted is not None:
+            _check_cameras(source, side, lenses[side], wanted)
+    return result
+
+
+def _read(source: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    caller = "load_pseudo_truth"
+    try:
+        with source.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+            manifest = json.loads(arrays.pop("manifest").tobytes().decode())
+    except FileNotFoundError:
+        raise
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        EOFError,
+        TypeError,
+        AttributeError,
+        zipfile.BadZipFile,
+        zlib.error,
+    ) as error:
+        raise ValueError(f"{caller}: {source} is not pseudo ground truth, or is truncated ({error})") from None
+    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
+        raise ValueError(f"{caller}: {source} is not pseudo ground truth (format must be {FORMAT!r})")
+    if manifest.get("format_version") != FORMAT_VERSION:
+        raise ValueError(
+            f"{caller}: {source} has version {manifest.get('format_version')!r}, this release reads {FORMAT_VERSION}"
+        )
+    hashes = manifest.get("sha256")
+    if not isinstance(hashes, dict) or set(hashes) != set(arrays):
+        raise ValueError(f"{caller}: {source}: sha256 must name exactly the arrays {sorted(arrays)}")
+    for name, values in arrays.items():
+        if values.dtype != _dtype(name) or _digest(values) != hashes[name]:
+            raise ValueError(f"{caller}: {source} was altered: {name} does not match its hash or is no {_dtype(name)}")
+    return manifest, arrays
+
+
+def _cameras(side: str, manifest: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Cameras:
+    poses, intrinsics, distortion = (arrays[f"{side}_{name}"] for name in LENSES)
+    width, height = (int(each) for each in manifest[f"{side}_size"])
+    return Cameras.create(poses, intrinsics, width, height, distortion)
+
+
+def _check(caller: str, maps: PseudoTruth) -> None:
+    shape = (len(maps.eval_cameras), maps.eval_cameras.height, maps.eval_cameras.width)
+    wanted = {"depth": shape, "normals": (*shape, 3), "seen_frustum": shape, "seen_open": shape}
+    for name, each in wanted.items():
+        values = getattr(maps, name)
+        if values is not None and values.shape != each:
+            raise ValueError(f"{caller}: {name} must have shape {each}, got {values.shape}")
+    check_depth(caller, "depth", maps.depth)
+    length = np.linalg.norm(maps.normals, axis=-1)
+    bad = int((np.abs(length[np.isfinite(length)] - 1) > 1e-3).sum())
+    if bad or np.isinf(maps.normals).any():
+        raise ValueError(f"{caller}: normals must be unit vectors or NaN, {bad} are not")
+    if len(maps.names) != shape[0] or len(set(maps.names)) != shape[0]:
+        raise ValueError(f"{caller}: names must be {shape[0]} different ones, got {list(maps.names)}")
+    if (maps.tolerance is None) != (maps.seen_open is None):
+        raise ValueError(f"{caller}: tolerance must be there if and only if seen_open is, got {maps.tolerance}")
+
+
+def _check_cameras(source: Path, side: str, stored: Cameras, wanted: Cameras) -> None:
+    here = (len(wanted), wanted.width, wanted.height)
+    there = (len(stored), stored.width, stored.height)
+    if here != there:
+        raise ValueError(
+            f"load_pseudo_truth: {source} is of {there[0]} {side} cameras of {there[1]} x {there[2]}, not of {here[0]} "
+            f"of {here[1]} x {here[2]}"
+        )
+    for name in LENSES:
+        first, second = getattr(stored, name), getattr(wanted, name)
+        size = max(float(np.abs(second).max(initial=0.0)), 1.0)
+        apart = np.abs(first - second).reshape(len(first), -1).max(axis=1, initial=0.0) / size
+        if (apart > SAME_CAMERA).any():
+            worst = int(apart.argmax())
+            raise ValueError(
+                f"load_pseudo_truth: {source} is of other {side} cameras: {name} of camera {worst} is off by "
+                f"{apart[worst] * size:.3g}"
+            )
+
+
+def _dtype(name: str) -> np.dtype[Any]:
+    return np.dtype(MAPS.get(name, "<f8"))
+
+
+def _counts(counts: NDArray[np.int64]) -> NDArray[np.uint16]:
+    return np.minimum(counts, np.iinfo(np.uint16).max).astype(np.uint16)
+
+
+def _digest(values: NDArray[Any]) -> str:
+    """SHA-256 of the shape (as text, ``2x3``) and of the little-endian bytes in C order."""
+    head = "x".join(map(str, values.shape)).encode()
+    return hashlib.sha256(head + b":" + np.ascontiguousarray(values, dtype=_dtype_of(values)).tobytes()).hexdigest()
+
+
+def _dtype_of(values: NDArray[Any]) -> np.dtype[Any]:
+    return values.dtype.newbyteorder("<")

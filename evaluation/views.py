@@ -1,0 +1,127 @@
+"""What is scored and what it is scored against: renders and the truth of the same views, checked once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.cameras import Cameras
+from .checks import Mask
+from .geometry import normals_from_depth
+
+COLOUR_SLACK = 1e-4  # renderers overshoot [0, 1] by rounding; more is refused, never clipped in silence
+
+
+def _colours(caller: str, name: str, values: NDArray[Any]) -> None:
+    if values.ndim != 4 or values.shape[-1] != 3 or not values.size:
+        raise ValueError(f"{caller}: {name} must have shape (n, H, W, 3) with pixels, got {values.shape}")
+    if not np.issubdtype(values.dtype, np.floating):
+        raise ValueError(f"{caller}: {name} must be floating point in [0, 1], got {values.dtype}: divide by 255 first")
+    inside = (values >= -COLOUR_SLACK) & (values <= 1 + COLOUR_SLACK)
+    if not inside.all():
+        raise ValueError(f"{caller}: {name} must lie in [0, 1], {int((~inside).sum())} values do not (NaN counts)")
+
+
+def _map_shape(caller: str, name: str, values: NDArray[Any] | None, shape: tuple[int, ...]) -> None:
+    if values is not None and values.shape != shape:
+        raise ValueError(f"{caller}: {name} must have shape {shape}, got {values.shape}")
+
+
+def check_depth(caller: str, name: str, values: NDArray[Any] | None) -> None:
+    """Depth must be > 0; inf is "no surface"; NaN is refused and counted."""
+    if values is not None and not (values > 0).all():
+        bad, nan = int((~(values > 0)).sum()), int(np.isnan(values).sum())
+        raise ValueError(f"{caller}: {name} must be > 0 (inf for no surface), {bad} values are not ({nan} NaN)")
+
+
+@dataclass(frozen=True, eq=False)
+class Renders:
+    """Rendered evaluation views of one method.
+
+    Attributes:
+        colours: ``(n, H, W, 3)`` sRGB in [0, 1].
+        depth: ``(n, H, W)`` along the unit ray, scene units, > 0, inf for no surface; None if not rendered.
+        accumulation: ``(n, H, W)`` opacity of the ray in [0, 1]; None if not rendered.
+        normals: ``(n, H, W, 3)`` unit, world axes, NaN where there is none; None: taken from the depth.
+    """
+
+    colours: NDArray[Any]
+    depth: NDArray[Any] | None = None
+    accumulation: NDArray[Any] | None = None
+    normals: NDArray[Any] | None = None
+
+    def __post_init__(self) -> None:
+        _colours("Renders", "colours", self.colours)
+        shape = self.colours.shape[:3]
+        _map_shape("Renders", "depth", self.depth, shape)
+        _map_shape("Renders", "accumulation", self.accumulation, shape)
+        _map_shape("Renders", "normals", self.normals, (*shape, 3))
+        check_depth("Renders", "depth", self.depth)
+
+    def __len__(self) -> int:
+        return len(self.colours)
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What the evaluation views really show.
+
+    Attributes:
+        photos: ``(n, H, W, 3)`` sRGB in [0, 1].
+        visible: ``(n, H, W)`` bool, what the training views saw; None if unknown.
+        depth: ``(n, H, W)`` as in :class:`Renders`: pseudo ground truth or exact; None if unknown.
+        normals: ``(n, H, W, 3)`` as in :class:`Renders`; None: taken from the depth.
+        cameras: the ``n`` cameras, to take normals from depth; None if normals are given or not asked for.
+        names: of the views, for rows and pages; ``0``, ``1``, … unless given.
+    """
+
+    photos: NDArray[Any]
+    visible: Mask | None = None
+    depth: NDArray[Any] | None = None
+    normals: NDArray[Any] | None = None
+    cameras: Cameras | None = None
+    names: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        _colours("Truth", "photos", self.photos)
+        shape = self.photos.shape[:3]
+        _map_shape("Truth", "visible", self.visible, shape)
+        _map_shape("Truth", "depth", self.depth, shape)
+        _map_shape("Truth", "normals", self.normals, (*shape, 3))
+        if self.visible is not None and self.visible.dtype != np.bool_:
+            raise ValueError(f"Truth: visible must be bool, got {self.visible.dtype}")
+        check_depth("Truth", "depth", self.depth)
+        if self.cameras is not None:
+            found = (len(self.cameras), self.cameras.height, self.cameras.width)
+            if found != shape:
+                raise ValueError(f"Truth: cameras must be {shape} (n, H, W), got {found}")
+        names = tuple(self.names) or tuple(str(index) for index in range(shape[0]))
+        if len(names) != shape[0] or len(set(names)) != len(names):
+            raise ValueError(f"Truth: names must be {shape[0]} different ones, got {len(names)} ({len(set(names))})")
+        object.__setattr__(self, "names", names)
+
+    def __len__(self) -> int:
+        return len(self.photos)
+
+
+def check_match(caller: str, renders: Renders, truth: Truth) -> None:
+    """Refuse renders of another number or size than the photos."""
+    if renders.colours.shape != truth.photos.shape:
+        raise ValueError(
+            f"{caller}: renders must have the photos' shape {truth.photos.shape}, got {renders.colours.shape}: "
+            "render at the photos' size, or resize the photos, before scoring"
+        )
+
+
+def view_normals(
+    normals: NDArray[Any] | None, depth: NDArray[Any] | None, cameras: Cameras | None, index: int
+) -> NDArray[Any] | None:
+    """Normals ``(H, W, 3)`` of one view: those given, else those of its depth ``(H, W)``; None for neither."""
+    if normals is not None:
+        return normals
+    if depth is None or cameras is None:
+        return None
+    return normals_from_depth(depth, cameras, index)
