@@ -150,7 +150,9 @@ def load_instant_ngp(path: str | Path) -> InstantNgpGrid:
             content = read_msgpack(cast(BinaryIO, _Limited(cast(BinaryIO, stream), MOST_BYTES)), wanted=_wanted)
         return _grid(content)
     except (MsgpackError, EOFError, OSError, zlib.error) as error:
-        raise ValueError(f"load_instant_ngp: {source} is not a snapshot of instant-ngp, or is cut short: {error}") from None
+        raise ValueError(
+            f"load_instant_ngp: {source} is not a snapshot of instant-ngp, or is cut short: {error}"
+        ) from None
 
 
 def _grid(content: Any) -> InstantNgpGrid:

@@ -91,7 +91,7 @@ class NerfPytorchField(nn.Module):
 
     def _encode(self, vectors: Tensor, bands: Tensor, with_input: bool) -> Tensor:
         angles = vectors.float()[:, None, :] * bands[:, None]
-        waves = torch.stack([angles.sin(), angles.cos()], dim=2).reshape(len(vectors), -1)
+        waves = torch.stack([angles.sin(), angles.cos()], dim=2).flatten(1)
         return torch.cat([vectors.float(), waves], dim=1) if with_input else waves
 
     def _hidden(self, positions: Tensor) -> Tensor:
@@ -255,7 +255,7 @@ def load_nerf_pytorch(
 def ndc_from_world(
     positions: NDArray[Any], *, focal: float, width: int, height: int, near: float = 1.0
 ) -> NDArray[np.float64]:
-    """Normalised device coordinates ``(..., 3)`` of ``positions (..., 3)`` before a camera (the NeRF paper, appendix C).
+    """Normalised device coordinates ``(..., 3)`` of ``positions (..., 3)`` before a camera (NeRF, appendix C).
 
     Args:
         positions: in the middle camera's coordinates (OpenGL: it looks along -Z), in the units of ``near``; z < 0.

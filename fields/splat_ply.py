@@ -174,7 +174,9 @@ def _layout(lines: tuple[str, ...]) -> tuple[int, np.dtype[np.void]]:
         elif words[0] == "property" and len(words) == 3 and words[1] in _TYPES and count >= 0 and len(fields) < 512:
             fields.append((words[2], f"<{_TYPES[words[1]]}"))
         else:
-            raise ValueError(f"the header's line {line[:60]!r} (wanted: binary_little_endian, one element, plain numbers)")
+            raise ValueError(
+                f"the header's line {line[:60]!r} (wanted: binary_little_endian, one element, plain numbers)"
+            )
     if not order or count < 0 or len({name for name, _ in fields}) != len(fields) or not fields:
         raise ValueError("its header names no format, no vertices, no properties, or one twice")
     return count, np.dtype(fields)

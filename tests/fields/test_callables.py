@@ -94,7 +94,7 @@ def test_what_a_ray_loses_does_not_depend_on_the_coordinates():
     there[:3, :3], there[:3, 3] = 0.2 * turn, [0.3, -1.0, 2.0]
     back = np.linalg.inv(there)
     t = np.linspace(-3, 3, 5001)
-    line = np.outer(t, [0.6, 0.0, 0.8]) + [0.05, 0.1, 0.0]
+    line = np.array([0.05, 0.1, 0.0]) + np.outer(t, [0.6, 0.0, 0.8])
     seen = transformed_density_fn(ball, there)(line @ back[:3, :3].T + back[:3, 3])
     step = 6 / 5000
     assert (seen * step / 0.2).sum() == pytest.approx((ball(line) * step).sum(), rel=1e-9)

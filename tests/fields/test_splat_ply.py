@@ -71,7 +71,9 @@ def test_keeping_all_gives_the_file_back(tmp_path):
 def test_a_score_that_is_there_is_replaced(tmp_path):
     write_splat_ply(tmp_path / "b.ply", read_splat_ply(write(tmp_path / "a.ply", table())),
                     keep=np.ones(20, bool), keep_score=np.zeros(20))  # fmt: skip
-    write_splat_ply(tmp_path / "c.ply", read_splat_ply(tmp_path / "b.ply"), keep=np.ones(20, bool), keep_score=np.ones(20))
+    write_splat_ply(
+        tmp_path / "c.ply", read_splat_ply(tmp_path / "b.ply"), keep=np.ones(20, bool), keep_score=np.ones(20)
+    )
     splats = read_splat_ply(tmp_path / "c.ply")
     assert splats.rows.dtype.names == (*NAMES, KEEP_SCORE)
     assert splats.rows[KEEP_SCORE].tolist() == [1.0] * 20
@@ -121,7 +123,9 @@ def test_properties_that_are_missing(tmp_path, name):
         read_splat_ply(write(tmp_path / "a.ply", rows))
 
 
-@pytest.mark.parametrize(("change", "rule"), [(-1, "1 bytes shorter"), (-5000, "shorter|no PLY header"), (3, "3 bytes longer")])
+@pytest.mark.parametrize(
+    ("change", "rule"), [(-1, "1 bytes shorter"), (-5000, "shorter|no PLY header"), (3, "3 bytes longer")]
+)
 def test_a_body_of_another_length(tmp_path, change, rule):
     path = write(tmp_path / "a.ply", table(100))
     data = path.read_bytes()
@@ -170,7 +174,9 @@ def test_no_file(tmp_path):
         read_splat_ply(tmp_path / "none.ply")
 
 
-@pytest.mark.parametrize(("name", "value"), [("x", np.nan), ("opacity", np.inf), ("scale_1", 90.0), ("scale_1", -1000.0)])
+@pytest.mark.parametrize(
+    ("name", "value"), [("x", np.nan), ("opacity", np.inf), ("scale_1", 90.0), ("scale_1", -1000.0)]
+)
 def test_values_that_are_none(tmp_path, name, value):
     rows = table()
     rows[name][[4, 9]] = value

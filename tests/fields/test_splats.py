@@ -79,7 +79,9 @@ def test_the_order_and_the_chunks_do_not_matter(monkeypatch):
     points = np.random.default_rng(5).uniform(-1, 1, (300, 3))
     whole = SplatField(gaussians, pitch=0.05).density_fn(points)
     order = np.random.default_rng(6).permutation(200)
-    shuffled = Gaussians(*(part[order] for part in (gaussians.means, gaussians.extents, gaussians.rotations, gaussians.logits)))
+    shuffled = Gaussians(
+        *(part[order] for part in (gaussians.means, gaussians.extents, gaussians.rotations, gaussians.logits))
+    )
     np.testing.assert_allclose(SplatField(shuffled, pitch=0.05).density_fn(points), whole, rtol=1e-5)
     monkeypatch.setattr(splats, "PAIRS", 7)
     np.testing.assert_allclose(SplatField(gaussians, pitch=0.05).density_fn(points), whole, rtol=1e-5)
