@@ -65,9 +65,7 @@ def main() -> None:
     mask = clean(grid.density_fn, grid.aabb, field_pitch=2 * grid.field_pitch)  # every second cell: four times as fast
 
     summary = mask.summary()
-    print(
-        f"{path}: {len(grid.density)} cascade(s), {summary['occupied']:,} occupied cells, {summary['removed']:,} removed"
-    )
+    print(f"{path}: {summary['removed']:,} of {summary['occupied']:,} occupied cells removed")
     if len(sys.argv) == 1:
         solid, floaters = scene()
         kept = mask.keep(cell_centers([[0, 0, 0], [1, 1, 1]], (CELLS,) * 3))

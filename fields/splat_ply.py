@@ -162,7 +162,8 @@ def read_splat_ply(path: str | Path) -> SplatPly:
 
 def _layout(lines: tuple[str, ...]) -> tuple[int, np.dtype[np.void]]:
     """Rows, and a row's layout."""
-    count, fields, order = -1, [], ""
+    count, order = -1, ""
+    fields: list[tuple[str, str]] = []
     for line in lines:
         words = line.split()
         if not words or words[0] in ("comment", "obj_info"):

@@ -66,6 +66,7 @@ class SplatField:
         self._whiten = (gaussians.rotations / spread[:, None, :]).transpose(0, 2, 1).astype(np.float32)
         depth = np.logaddexp(0.0, gaussians.logits)
         self._peaks = depth / (np.sqrt(2.0 * np.pi) * spread.min(axis=1))
+        self._reach_squared = (CUT * spread.max(axis=1)) ** 2
         reach = CUT * np.sqrt(np.einsum("nij,nj->ni", gaussians.rotations**2, spread**2))
         self._levels = list(_levels(gaussians.means, reach))
 
@@ -76,13 +77,15 @@ class SplatField:
             raise ValueError(f"SplatField.density_fn: positions must have shape (..., 3), got {points.shape}")
         flat = points.reshape(-1, 3)
         total = np.zeros(len(flat))
-        finite = np.isfinite(flat).all(axis=1)
+        finite = np.asarray(np.isfinite(flat).all(axis=1))
         for level in self._levels:
             for rows, members in _pairs(level, np.where(finite[:, None], flat, 0.0)):
-                apart = (flat[rows] - self._means[members]).astype(np.float32)
-                whitened = np.einsum("nij,nj->ni", self._whiten[members], apart)
+                apart = flat[rows] - self._means[members]
+                close = np.flatnonzero(np.einsum("ni,ni->n", apart, apart) < self._reach_squared[members])
+                rows, members = rows[close], members[close]
+                whitened = np.matmul(self._whiten[members], apart[close].astype(np.float32)[:, :, None])[:, :, 0]
                 square = np.einsum("ni,ni->n", whitened, whitened)
-                near = square < CUT**2
+                near = np.flatnonzero(square < CUT**2)
                 value = self._peaks[members[near]] * np.exp(-0.5 * square[near])
                 total += np.bincount(rows[near], value, len(flat))
         total[~finite] = np.nan
@@ -92,7 +95,8 @@ class SplatField:
 def _keys(cells: NDArray[np.float64]) -> NDArray[np.int64]:
     """One number for each cell ``(..., 3)``. Far cells may share one: that costs time, never a wrong value."""
     x, y, z = np.moveaxis(np.mod(cells, _WRAP).astype(np.int64), -1, 0)
-    return (x * _WRAP + y) * _WRAP + z
+    keys: NDArray[np.int64] = (x * _WRAP + y) * _WRAP + z
+    return keys
 
 
 def _levels(means: NDArray[np.float64], reach: NDArray[np.float64]) -> Iterator[_Level]:

@@ -1,3 +1,6 @@
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -117,3 +120,12 @@ def test_sum():
     assert total(torch.tensor([[[1.0, 10.0, 0.0]]])).tolist() == [[21.0]]
     with pytest.raises(ValueError, match="at least one"):
         summed_density_fn([])
+
+
+@pytest.mark.parametrize(
+    "name", ["callables", "sdf_density", "instant_ngp", "msgpack_stream", "splat_ply", "splats", "nerf_pytorch"]
+)
+def test_torch_is_needed_by_the_checkpoints_only(name):
+    code = f"import sys; sys.modules['torch'] = None; import unghost.fields.{name}"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
+    assert (done.returncode == 0) == (name != "nerf_pytorch"), done.stderr
