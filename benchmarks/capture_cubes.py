@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from capture import Options as CaptureOptions
 from capture import Sweep, fit_field, render
-from fit_cache import FitCache, code_hash, say
+from fit_cache import FitCache, code_hash, file_hash, say
 from numpy.typing import NDArray
 
 import unghost.fields
@@ -28,6 +28,8 @@ from unghost.core.aabb import contains
 from unghost.core.cameras import Cameras
 from unghost.core.occupancy import FREE_LABEL, IGNORE_LABEL, SURFACE_LABEL
 from unghost.core.shards import write_shard
+from unghost.data_recipes import harvest as harvest_module
+from unghost.data_recipes import harvest_labels as labels_module
 from unghost.data_recipes.harvest import harvest_cubes
 from unghost.data_recipes.harvest_config import HarvestConfig
 from unghost.data_recipes.harvest_labels import BEHIND_BAND, FREE_BAND, SURFACE_BAND
@@ -71,18 +73,23 @@ class PseudoTruth:
         return votes
 
     def labels(
-        self, positions: NDArray[np.float64], field_pitch: float, opaque: NDArray[np.bool_]
+        self, positions: NDArray[np.float64], field_pitch: float, opaque: NDArray[np.bool_], hidden: NDArray[np.bool_]
     ) -> NDArray[np.uint8]:
         """As ``data_recipes.harvest_labels.Labeller`` has it."""
         points = positions.reshape(-1, 3)
         through, surface, behind = self.votes(points, field_pitch).reshape(3, *positions.shape[:-1])
-        seen = self.cameras.view_count(points).reshape(positions.shape[:-1]) > 0
         counts = contains(self.aabb, positions)
         labels = np.full(counts.shape, IGNORE_LABEL, dtype=np.uint8)
-        labels[counts & seen & (through >= VOTES) & (through > surface)] = FREE_LABEL
-        labels[counts & opaque & (behind >= VOTES) & (through == 0)] = SURFACE_LABEL
+        labels[counts & (through >= VOTES) & (through > surface)] = FREE_LABEL
+        labels[counts & opaque & ~hidden & (behind >= VOTES) & (through == 0)] = SURFACE_LABEL
         labels[counts & (surface >= VOTES) & (surface >= through)] = SURFACE_LABEL
         return labels
+
+
+def cubes_folder(cache: Path, cubes: int) -> Path:
+    """Where so many cubes a seed are kept, under the hash of the rules that cut and label them."""
+    rules = "".join(file_hash(source)[:6] for source in (__file__, harvest_module.__file__, labels_module.__file__))
+    return cache / f"cubes-{cubes}-{rules}"
 
 
 def capture_shards(

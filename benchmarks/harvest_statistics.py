@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 import tyro
-from capture_cubes import capture_shards
+from capture_cubes import capture_shards, cubes_folder
 from fit_cache import say
 
 from unghost.core.occupancy import signed_from_occupancy
@@ -128,7 +128,7 @@ def synthetic_sets(options: Options, folder: Path) -> Iterator[tuple[str, CubeSt
 def all_sets(options: Options, folder: Path) -> Iterator[tuple[str, CubeStatistics]]:
     """The capture's first."""
     each = -(-options.cubes // len(options.seeds))
-    cut = options.cache / f"cubes-{each}"
+    cut = cubes_folder(options.cache, each)
     shards = capture_shards(
         options.capture, cut, train=options.train, better=options.better, cubes=each, seeds=options.seeds,
         cache=options.cache,

@@ -19,11 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.aabb import scene_extent
+from ..core.channels import full_channel
 from ..core.cube_views import count_views
 from ..core.frames import RESOLUTION, cube_lattices, random_rotations
 from ..core.occupancy import DEFAULT_OPACITY_THRESHOLD, opacity_from_density, opacity_from_signed
 from ..core.shards import (
     TRANSMITTANCE_RESOLUTION,
+    dequantize_share,
     dequantize_signed,
     pack_labels,
     quantize_share,
@@ -37,7 +39,7 @@ from .engines import LocalEngine
 from .folder_lock import locked
 from .harvest_config import HarvestConfig
 from .harvest_context import signed_opacity, surroundings
-from .harvest_labels import Labeller, Truth, check_fit, severity_of
+from .harvest_labels import HIDDEN, Labeller, Truth, check_fit, severity_of
 from .harvest_resume import finished, scene_folder
 from .harvest_rooms import draw_objects_of, room_cubes
 
@@ -46,6 +48,7 @@ if TYPE_CHECKING:
     from ..fields.kinds import TrainableField
     from ..fields.scenes import PhotographedScene
 
+OBSERVER_STREAM = 0x6F6273  # keeps the other sweep apart from all else
 EARLY = 0.45  # share of the fit at which the first cubes are taken
 TOGETHER, QUERY = 8, 1 << 17  # cubes, and points in them, that are worked on at a time
 
@@ -93,18 +96,21 @@ def harvest_cubes(
         some = slice(start, start + TOGETHER)
         frames = (centers[some], edges[some], rotations[some])
         lattice = cube_lattices(*frames)
-        inputs = signed_opacity(density_fn, lattice, assumed_pitch[some], field.aabb)
+        stored = quantize_signed(signed_opacity(density_fn, lattice, assumed_pitch[some], field.aabb))
+        inputs = dequantize_signed(stored)  # labels are of what a shard holds
         opaque = opacity_from_signed(inputs) > DEFAULT_OPACITY_THRESHOLD
-        labels = truth.labels(lattice, field.field_pitch, opaque)
         coarse = cube_lattices(*frames, resolution=TRANSMITTANCE_RESOLUTION)
+        light = quantize_share(maps.best_view(coarse))
+        hidden = full_channel(dequantize_share(light)) < HIDDEN
+        labels = truth.labels(lattice, field.field_pitch, opaque, hidden)
         about = surroundings(density_fn, *frames, assumed_pitch[some], field.aabb)
         parts.append({
-            "inputs": quantize_signed(inputs),
+            "inputs": stored,
             "labels": pack_labels(labels),
             "severity": severity_of(inputs, labels),
             "surroundings": quantize_signed(about),
             "view_count": count_views(truth.cameras, *frames),
-            "transmittance": quantize_share(maps.best_view(coarse)),
+            "transmittance": light,
         })  # fmt: skip
     arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     arrays["edge_fraction"] = (edges / scene_extent(field.aabb)).astype(np.float32)
@@ -142,6 +148,7 @@ def harvest_scene(
     With a folder of meshes, some of its ``train`` split stand among the furniture (:mod:`.mesh_objects`).
     """
     from ..fields.rendering import Sampling
+    from ..fields.scenes import observers
     from ..fields.training import TrainingConfig, train_field
 
     rng = np.random.default_rng([seed, index])
@@ -155,7 +162,8 @@ def harvest_scene(
         distortion_weight=float(rng.choice([0.0, 0.002, 0.01])),
         sampling=Sampling(near_samples=samples, far_samples=max(12, samples // 4)),
     )
-    truth = Truth(photographed, field.aabb)
+    others = observers(np.random.default_rng([seed, index, OBSERVER_STREAM]), photographed.scene)
+    truth = Truth(photographed, field.aabb, observers=others)
     parts: list[dict[str, NDArray[Any]]] = []
 
     def snapshot(fitted: TrainableField, step: int) -> None:

@@ -1,10 +1,13 @@
 """Three-valued labels of a photographed scene of known geometry, and how bad a field is by them.
 
 surface  within three quarters of a field cell of a surface that some training photo sees, and what is
-         opaque up to four cells behind such a surface: a field spreads a surface over several of its cells,
-         and what lies behind the front is part of what makes it opaque
-free     more than one and a half cells outside every solid: whatever is opaque there is a ghost
-ignore   the rest of solids and walls, surfaces that no photo sees, the band between, outside the box
+         opaque up to four cells behind such a surface, as long as some light gets out from there: a field
+         spreads a surface over several of its cells, and what lies behind the front is part of what makes it
+         opaque, but not what lies behind all that (nobody sees whether it is there)
+free     more than one and a half cells outside every solid; and what is opaque there is a ghost if a viewer can look
+         at it: a training photo, or one of another sweep through the scene
+ignore   the rest of solids and walls, surfaces that no photo sees, opacity that no viewer sees, the band between,
+         outside the box
 """
 
 from __future__ import annotations
@@ -24,6 +27,8 @@ from ..core.occupancy import (
     opacity_from_signed,
 )
 
+HIDDEN = 0.05  # share of light from a place that no training camera gets more of
+Observers = tuple[Cameras, NDArray[np.float64]]
 SURFACE_BAND, FREE_BAND, BEHIND_BAND = 0.75, 1.5, 4.0  # in field cells
 
 
@@ -62,19 +67,34 @@ class Labeller(Protocol):
         """Those of the training photos, as the field was told."""
 
     def labels(
-        self, positions: NDArray[np.float64], field_pitch: float, opaque: NDArray[np.bool_]
+        self, positions: NDArray[np.float64], field_pitch: float, opaque: NDArray[np.bool_], hidden: NDArray[np.bool_]
     ) -> NDArray[np.uint8]:
-        """Three-valued labels ``(...)`` of world ``positions (..., 3)``, ``opaque (...)`` in the field or not."""
+        """Three-valued labels ``(...)`` of world ``positions (..., 3)``.
+
+        ``opaque`` and ``hidden``, both ``(...)``, are of the field: whether a place is opaque in it, and whether no
+        training camera gets any light from there.
+        """
 
 
 class Truth:
     """The labels of a photographed scene; a coarse grid of exact distances settles most points.
 
     A signed distance changes by no more than one goes, so that a node far from any surface speaks for its cell.
+
+    Args:
+        photographed: the scene.
+        aabb: ``(2, 3)``, outside of which nothing counts.
+        observers: cameras of another sweep and their true depth maps.
+        nodes: of the coarse grid, along an axis.
     """
 
-    def __init__(self, photographed: Photographed, aabb: NDArray[np.float64], *, nodes: int = 64) -> None:
+    def __init__(
+        self, photographed: Photographed, aabb: NDArray[np.float64], *, observers: Observers | None = None,
+        nodes: int = 64,
+    ) -> None:  # fmt: skip
         self.photographed, self.aabb = photographed, aabb
+        self.observers: list[Observers] = [(photographed.true_cameras, photographed.depth_maps)]
+        self.observers += [] if observers is None else [observers]
         axes = [np.linspace(aabb[0, axis], aabb[1, axis], nodes) for axis in range(3)]
         self._coarse = photographed.scene.signed_distance(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1))
         self._cell = (aabb[1] - aabb[0]) / (nodes - 1)
@@ -98,22 +118,29 @@ class Truth:
         return distance
 
     def labels(
-        self, positions: NDArray[np.float64], field_pitch: float, opaque: NDArray[np.bool_]
+        self, positions: NDArray[np.float64], field_pitch: float, opaque: NDArray[np.bool_], hidden: NDArray[np.bool_]
     ) -> NDArray[np.uint8]:
-        """Three-valued labels ``(...)`` of world ``positions (..., 3)``, ``opaque (...)`` in the field or not."""
+        """Three-valued labels ``(...)`` of world ``positions (..., 3)``; see :class:`Labeller`."""
         labels = np.full(positions.shape[:-1], IGNORE_LABEL, dtype=np.uint8)
         inside = contains(self.aabb, positions)
         flat = positions[inside]
         distance = self.distances(flat, np.where(opaque[inside], BEHIND_BAND, FREE_BAND) * field_pitch)
         found = np.full(len(flat), IGNORE_LABEL, dtype=np.uint8)
         found[distance > FREE_BAND * field_pitch] = FREE_LABEL
+        ghosts = np.flatnonzero(opaque[inside] & (found == FREE_LABEL))
+        found[ghosts[~self._observed(flat[ghosts])]] = IGNORE_LABEL
         near = np.abs(distance) <= SURFACE_BAND * field_pitch
-        behind = opaque[inside] & (distance < 0) & (distance >= -BEHIND_BAND * field_pitch) & ~near
+        behind = (opaque & ~hidden)[inside] & (distance < 0) & (distance >= -BEHIND_BAND * field_pitch) & ~near
         for band, reach in ((near, 2.0), (behind, 2.0 + BEHIND_BAND)):
             chosen = np.flatnonzero(band)
             found[chosen[self._seen(flat[chosen], reach * field_pitch)]] = SURFACE_LABEL
         labels[inside] = found
         return labels
+
+    def _observed(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Whether some viewer has ``points (N, 3)`` in the frustum and before the true surface."""
+        views = sum(cameras.view_count(points, depth_maps=depth, tolerance=0.0) for cameras, depth in self.observers)
+        return np.asarray(views > 0)
 
     def _seen(self, points: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
         """Whether some photo shows ``points (N, 3)``, or a surface at most ``reach`` in front of them."""

@@ -148,6 +148,29 @@ def photograph(
     return PhotographedScene(scene, Cameras.create(jitter, intrinsics, width, height), cameras, images, depth_maps)
 
 
+def observers(
+    rng: np.random.Generator, scene: SolidScene, *, count: int = 16, width: int = 64, height: int = 48
+) -> tuple[Cameras, NDArray[np.float64]]:
+    """Another sweep through a scene, of which only the depth is kept: where might a viewer look later?
+
+    Returns:
+        The cameras, and depth along the optical axis ``(count, height, width)``, inf for sky. No cameras if there is
+        no free path.
+    """
+    try:
+        poses = sweep(rng, scene, count)
+    except RuntimeError:
+        poses = np.zeros((0, 3, 4))
+    focal = width / (2 * np.tan(np.deg2rad(rng.uniform(50, 75)) / 2))
+    cameras = Cameras.create(poses, np.array([focal, focal, width / 2, height / 2]), width, height)
+    depth_maps = np.zeros((len(poses), height, width))
+    for index in range(len(poses)):
+        origins, directions = (ray.reshape(-1, 3) for ray in cameras.rays(index))
+        distance = scene.trace(origins, directions)
+        depth_maps[index] = (distance * -(directions @ poses[index, :, 2])).reshape(height, width)
+    return cameras, depth_maps
+
+
 def _small_rotations(axes: Array) -> Array:
     """Rotation matrices ``(N, 3, 3)`` for rotation vectors ``(N, 3)`` in radians (Rodrigues)."""
     angle = np.linalg.norm(axes, axis=1)[:, None, None]

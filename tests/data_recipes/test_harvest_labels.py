@@ -4,13 +4,16 @@ import pytest
 from unghost.core.occupancy import FREE_LABEL, IGNORE_LABEL, SURFACE_LABEL
 from unghost.data_recipes.harvest_labels import Truth, check_fit, severity_of
 
+pytest.importorskip("torch")
+from unghost.fields.scenes import observers
+
 AABB = np.array([[-1.0] * 3, [1.0] * 3])
 
 
-def labels_one_by_one(photographed, positions, pitch, opaque):
+def labels_one_by_one(photographed, positions, pitch, opaque, hidden, observers):
     """The definition in the module's text, a point at a time, with the plain minimum over all solids."""
     labels = []
-    for position, filled in zip(positions, opaque):
+    for position, filled, dark in zip(positions, opaque, hidden):
         distance = min(float(solid.distance(position[None])[0]) for solid in photographed.scene.solids)
         seen, shallow = False, False
         for index in range(len(photographed.true_cameras)):
@@ -20,11 +23,19 @@ def labels_one_by_one(photographed, positions, pitch, opaque):
                 front = photographed.depth_maps[index, row, column]
                 seen |= bool(depth <= 1.02 * (front + 2 * pitch))
                 shallow |= bool(depth <= 1.02 * (front + 6 * pitch))
+        watched = False
+        for cameras, depth_maps in observers:
+            for index in range(len(cameras)):
+                pixel, depth, visible = cameras.project(index, position)
+                row = min(int(max(pixel[1], 0)), cameras.height - 1)
+                column = min(int(max(pixel[0], 0)), cameras.width - 1)
+                watched |= bool(visible and depth <= depth_maps[index, row, column])
+        behind = filled and not dark and shallow and -4 * pitch <= distance < 0
         if not ((position >= -1) & (position <= 1)).all():
             labels.append(IGNORE_LABEL)
         elif distance > 1.5 * pitch:
-            labels.append(FREE_LABEL)
-        elif seen if abs(distance) <= 0.75 * pitch else filled and shallow and -4 * pitch <= distance < 0:
+            labels.append(IGNORE_LABEL if filled and not watched else FREE_LABEL)
+        elif seen if abs(distance) <= 0.75 * pitch else behind:
             labels.append(SURFACE_LABEL)
         else:
             labels.append(IGNORE_LABEL)
@@ -36,10 +47,18 @@ def labels_one_by_one(photographed, positions, pitch, opaque):
 def test_labels_follow_their_definition(photographed, pitch, nodes):
     rng = np.random.default_rng(1)
     positions = rng.uniform(-1.1, 1.1, size=(2500, 3))
-    opaque = rng.random(2500) < 0.5
-    labels = Truth(photographed, AABB, nodes=nodes).labels(positions, pitch, opaque)
+    opaque, hidden = rng.random(2500) < 0.5, rng.random(2500) < 0.3
+    others = observers(np.random.default_rng(5), photographed.scene, count=2, width=20, height=16)
+    assert len(others[0]) == 2
+    truth = Truth(photographed, AABB, nodes=nodes, observers=others)
+    labels = truth.labels(positions, pitch, opaque, hidden)
     assert labels.dtype == np.uint8
-    np.testing.assert_array_equal(labels, labels_one_by_one(photographed, positions, pitch, opaque))
+    watching = [(photographed.true_cameras, photographed.depth_maps), others]
+    expected = labels_one_by_one(photographed, positions, pitch, opaque, hidden, watching)
+    np.testing.assert_array_equal(labels, expected)
+    alone = Truth(photographed, AABB, nodes=nodes).labels(positions, pitch, opaque, hidden)
+    assert ((alone == FREE_LABEL) <= (labels == FREE_LABEL)).all()
+    assert (alone != labels).any()
     assert set(np.unique(labels)) == {FREE_LABEL, SURFACE_LABEL, IGNORE_LABEL}
 
 
@@ -54,15 +73,19 @@ def test_labels_by_hand(photographed):
         ball + 0.24 * toward,  # three cells behind the skin that they see
         ball + np.array([-0.24, 0.0, 0.0]),  # three cells behind the skin that they do not
         ball + 0.32 * toward,  # one cell out: the band between
-        np.array([0.0, 0.0, 0.9]),  # air
+        ball + 0.5 * toward,  # air before the cameras
+        np.array([0.0, 0.0, 0.9]),  # air that nobody looks at
+        np.array([-0.5, 0.75, -0.2]),  # air behind the ball, hidden by it
         np.array([0.0, 0.0, 1.1]),  # air outside the box
-    ]).reshape(2, 4, 3)  # fmt: skip
-    opaque = np.ones((2, 4), dtype=bool)
+    ]).reshape(2, 5, 3)  # fmt: skip
+    opaque, light = np.ones((2, 5), dtype=bool), np.zeros((2, 5), dtype=bool)
     seen, ignored, free = SURFACE_LABEL, IGNORE_LABEL, FREE_LABEL
-    expected = np.array([[seen, ignored, ignored, seen], [ignored, ignored, free, ignored]])
-    np.testing.assert_array_equal(truth.labels(positions, 0.02, opaque), expected)
-    expected[0, 3] = ignored  # what the field left empty behind the skin is no fault
-    np.testing.assert_array_equal(truth.labels(positions, 0.02, ~opaque), expected)
+    expected = np.array([[seen, ignored, ignored, seen, ignored], [ignored, free, ignored, ignored, ignored]])
+    np.testing.assert_array_equal(truth.labels(positions, 0.02, opaque, light), expected)
+    expected[0, 3] = ignored  # what the field left empty behind the skin is no fault, nor what nobody sees there
+    np.testing.assert_array_equal(truth.labels(positions, 0.02, opaque, ~light), expected)
+    expected[1, 2:4] = free  # air that is empty in the field too is nobody's ghost
+    np.testing.assert_array_equal(truth.labels(positions, 0.02, ~opaque, light), expected)
 
 
 def test_coarse_distances_are_exact_where_it_matters(photographed):

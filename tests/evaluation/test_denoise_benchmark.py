@@ -149,5 +149,7 @@ def test_pseudo_truth_goes_by_the_votes_of_the_photos(parts):
     truth = parts["capture"].PseudoTruth(cameras.select([0]), np.array([[-1.0] * 3, [1.0] * 3]), cameras, depth)
     places = np.array([[-0.5, 0, 0], [0.0, 0, 0], [0.05, 0, 0], [0.05, 0, 0], [0.5, 0, 0], [-1.5, 0, 0]])
     opaque = np.array([True, True, True, False, True, True])
-    labels = truth.labels(places, 0.02, opaque)
+    dark = np.zeros(6, dtype=bool)
+    labels = truth.labels(places, 0.02, opaque, dark)
+    assert truth.labels(places, 0.02, opaque, ~dark)[2] == IGNORE_LABEL
     assert labels.tolist() == [FREE_LABEL, SURFACE_LABEL, SURFACE_LABEL, IGNORE_LABEL, IGNORE_LABEL, IGNORE_LABEL]
