@@ -139,7 +139,7 @@ def harvest_set(name: str, folder: Path, count: int) -> CubeSet:
 def capture_set(capture: Path, cache: Path, count: int) -> CubeSet:
     """Cubes of fields of a real capture (its first sweep), three seeds, labelled by a field that saw the third too."""
     shards = capture_shards(
-        capture, cubes_folder(cache, CAPTURE_CUBES), train="trajectory_1", better=("trajectory_3",), cubes=CAPTURE_CUBES,
-        seeds=(0, 1, 2), cache=cache,
+        capture, cubes_folder(cache, CAPTURE_CUBES), train="trajectory_1", better=("trajectory_3",),
+        cubes=CAPTURE_CUBES, seeds=(0, 1, 2), cache=cache,
     )  # fmt: skip
     return from_shards("capture", [read_shard(path) for path in shards], count)
