@@ -97,6 +97,15 @@ for out, (kind, number, _) in spec["moments"].items():
 """
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _one_thread():
+    """As the killed runs have: sums of several threads are taken in another order."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
 @pytest.fixture(scope="module")
 def config():
     from unghost.prior.config import TrainConfig
