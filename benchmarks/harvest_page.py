@@ -173,7 +173,8 @@ def page(options: Options, found: dict[str, Any], sample_bytes: int) -> str:
         f"Fields (kind, cells along an axis): {kinds}. PSNR on their own photos: {middle:.1f} dB (one in ten below "
         f"{low:.1f}, one above {high:.1f}). {found['with_meshes']} scenes hold some of {found['meshes']} different "
         "meshes beside procedural furniture.", "",
-        "    unghost harvest --out out/harvest --scenes 210 --seed 0 --workers 2 --mesh-root MESHES", "",
+        f"    unghost harvest --out out/harvest --scenes {options.scenes or found['scenes']} --seed 0 --workers 2 "
+        "--mesh-root MESHES", "",
         "It can be killed and started again; scene i depends on (seed, i) alone. A frequency-encoded MLP is never "
         "harvested for training (`--kinds mlp --seed 1` makes the set that is held out).", "",
         "![six pairs, one a row](harvest/pairs.png)", "",

@@ -27,7 +27,7 @@ from fit_cache import say
 
 from unghost.core.occupancy import signed_from_occupancy
 from unghost.core.results import build_results, write_results
-from unghost.core.shards import read_shard
+from unghost.core.shards import quantize_signed, read_shard
 from unghost.data_recipes.augment import CORRUPTIONS
 from unghost.data_recipes.curate import curate
 from unghost.data_recipes.harvest import harvest
@@ -102,7 +102,7 @@ def corrupted(family: str, count: int) -> CubeStatistics:
     for row, stored in enumerate(chunk.arrays["inputs"]):
         rng = np.random.default_rng([SEED, row])
         damaged = CORRUPTIONS[family](rng, stored > 127, float(rng.uniform(0.02, 1.0)))
-        inputs[row] = np.where(signed_from_occupancy(damaged) > 0, 255, 0)
+        inputs[row] = quantize_signed(signed_from_occupancy(damaged))
     return cube_statistics(inputs)
 
 

@@ -58,9 +58,7 @@ def check_channels(names: Sequence[str], *, caller: str) -> tuple[str, ...]:
 
 def encode_surroundings(signed: NDArray[np.floating]) -> Float32:
     """Mean signed opacity ``(...)`` in [-1, 1] to the channel's values in [-1/2, 1]."""
-    share = (np.asarray(signed, dtype=np.float32) - np.float32(EMPTY)) / np.float32(OCCUPIED - EMPTY)
-    encoded: Float32 = np.float32(LEAST_KNOWN) + np.float32(1.0 - LEAST_KNOWN) * share
-    return encoded
+    return encode_share((np.asarray(signed, dtype=np.float32) - np.float32(EMPTY)) / np.float32(OCCUPIED - EMPTY))
 
 
 def encode_view_count(counts: NDArray[np.integer]) -> Float32:
@@ -71,12 +69,11 @@ def encode_view_count(counts: NDArray[np.integer]) -> Float32:
     """
     capped = np.minimum(np.asarray(counts), MAX_VIEW_COUNT).astype(np.float32)
     share = np.log2(np.float32(1.0) + capped) / np.float32(math.log2(1.0 + MAX_VIEW_COUNT))
-    encoded: Float32 = (np.float32(LEAST_KNOWN) + np.float32(1.0 - LEAST_KNOWN) * share).astype(np.float32)
-    return encoded
+    return encode_share(share)
 
 
-def encode_transmittance(share: NDArray[np.floating]) -> Float32:
-    """Shares of light ``(...)`` in [0, 1] to the channel's values in [-1/2, 1]."""
+def encode_share(share: NDArray[np.floating]) -> Float32:
+    """Shares ``(...)`` in [0, 1], of light for ``transmittance``, to an optional channel's values in [-1/2, 1]."""
     encoded: Float32 = np.float32(LEAST_KNOWN) + np.float32(1.0 - LEAST_KNOWN) * np.asarray(share, dtype=np.float32)
     return encoded
 
@@ -114,7 +111,7 @@ def encode_known(
     if view_count is not None:
         known[VIEW_COUNT] = encode_view_count(view_count)
     if transmittance is not None:
-        known[TRANSMITTANCE] = encode_transmittance(transmittance)
+        known[TRANSMITTANCE] = encode_share(transmittance)
     return known
 
 

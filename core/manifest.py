@@ -8,7 +8,6 @@ import math
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from .channels import CHANNEL_NAMES as CHANNEL_NAMES
 from .channels import check_channels
 from .frames import RESOLUTION
 from .schedule import TIMESTEPS

@@ -15,8 +15,8 @@ from ..core.channels import (
     SURROUNDINGS,
     TRANSMITTANCE,
     VIEW_COUNT,
+    encode_share,
     encode_surroundings,
-    encode_transmittance,
     encode_view_count,
     pool_surroundings,
 )
@@ -74,7 +74,7 @@ def light_maps(
 def light_channel(maps: TransmittanceMaps, centers: NDArray[np.float64], edges: NDArray[np.float64]) -> FloatGrid:
     """The channel ``transmittance`` of axis-aligned cubes ``(N, 3)``, ``(N,)``: ``(N, 16, 16, 16)``."""
     lattice = cube_lattices(centers, edges, None, resolution=TRANSMITTANCE_RESOLUTION)
-    return encode_transmittance(maps.best_view(lattice))
+    return encode_share(maps.best_view(lattice))
 
 
 class GridContext:

@@ -9,16 +9,6 @@ from unghost.evaluation.flip import flip, flip_map
 PPD = module.PIXELS_PER_DEGREE
 
 
-def _pattern():
-    """Two images with waves, edges and flat squares, from formulas alone."""
-    row, column = np.mgrid[0:48, 0:64]
-    checks = (row // 8 + column // 8) % 2
-    wave = (np.cos(0.17 * column) + 1) / 2
-    target = np.stack([(np.sin(0.31 * row) + 1) / 2, wave, checks * 0.8 + 0.1], axis=-1)
-    preds = np.stack([(np.sin(0.31 * row + 0.4) + 1) / 2, wave * 0.9, checks * 0.6 + 0.2], axis=-1)
-    return preds, target
-
-
 def _flat(colour, shape=(12, 16)):
     return np.broadcast_to(np.array(colour, dtype=float), (*shape, 3)).copy()
 
@@ -31,8 +21,8 @@ def _flat(colour, shape=(12, 16)):
         (20.0, 0.42933102, (0.69581896, 0.64949226, 0.49601585)),
     ],
 )
-def test_equals_the_authors_implementation(pixels_per_degree, mean, pixels):
-    preds, target = _pattern()
+def test_equals_the_authors_implementation(pattern, pixels_per_degree, mean, pixels):
+    preds, target = pattern
     found = flip_map(preds, target, pixels_per_degree=pixels_per_degree)
     assert found.mean() == pytest.approx(mean, abs=5e-6)
     assert [found[0, 0], found[20, 33], found[47, 63]] == pytest.approx(pixels, abs=5e-5)
@@ -91,9 +81,9 @@ def test_a_larger_step_never_looks_smaller():
     assert (np.diff(steps) > 0).all()
 
 
-def test_more_noise_looks_worse():
+def test_more_noise_looks_worse(pattern):
     rng = np.random.default_rng(1)
-    _, target = _pattern()
+    _, target = pattern
     noise = rng.uniform(-1, 1, target.shape)
     means = [flip_map(np.clip(target + d * noise, 0, 1), target).mean() for d in (0, 0.02, 0.1, 0.4)]
     assert (np.diff(means) > 0.01).all()
@@ -118,8 +108,8 @@ def test_seen_from_afar_fine_detail_vanishes():
     assert far < 0.05
 
 
-def test_the_masked_mean_sees_nothing_outside_the_mask():
-    preds, target = _pattern()
+def test_the_masked_mean_sees_nothing_outside_the_mask(pattern):
+    preds, target = pattern
     mask = np.zeros(preds.shape[:2], dtype=bool)
     mask[10:30, 5:40] = True
     wanted = flip(preds, target, mask)

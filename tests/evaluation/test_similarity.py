@@ -6,17 +6,10 @@ from skimage.metrics import structural_similarity
 
 from unghost.evaluation.similarity import SSIM_CONVENTIONS, ssim
 
+ROWS, COLUMNS = np.mgrid[0:48, 0:64]
+DISC = (ROWS - 20) ** 2 + (COLUMNS - 30) ** 2 < 17**2
 OFFSETS = np.arange(-5, 6)
 WINDOW = np.exp(-0.5 * (OFFSETS[:, None] ** 2 + OFFSETS[None] ** 2) / 1.5**2)
-
-
-def _pattern():
-    row, column = np.mgrid[0:48, 0:64]
-    checks = (row // 8 + column // 8) % 2
-    wave = (np.cos(0.17 * column) + 1) / 2
-    target = np.stack([(np.sin(0.31 * row) + 1) / 2, wave, checks * 0.8 + 0.1], axis=-1)
-    preds = np.stack([(np.sin(0.31 * row + 0.4) + 1) / 2, wave * 0.9, checks * 0.6 + 0.2], axis=-1)
-    return preds, target, (row - 20) ** 2 + (column - 30) ** 2 < 17**2
 
 
 def _noise(seed, shape=(14, 17, 2)):
@@ -71,16 +64,16 @@ def test_equals_a_loop_over_windows(convention):
     assert found == pytest.approx(_oracle(preds, target, mask, convention), abs=1e-10)
 
 
-def test_the_published_codes_map_is_torchmetrics():
+def test_the_published_codes_map_is_torchmetrics(pattern):
     # torchmetrics 1.9, structural_similarity_index_measure(..., return_full_image=True) of the blanked images,
     # averaged over the mask
-    preds, target, mask = _pattern()
+    preds, target, mask = (*pattern, DISC)
     found = ssim(preds, target, mask, data_range=1.0, convention="premasked_over_mask")
     assert found == pytest.approx(0.9086088130906628, abs=1e-12)
 
 
-def test_whole_windows_are_scikit_images():
-    preds, target, mask = _pattern()
+def test_whole_windows_are_scikit_images(pattern):
+    preds, target, mask = (*pattern, DISC)
     oracle = structural_similarity(
         preds * mask[..., None], target * mask[..., None], gaussian_weights=True, sigma=1.5,
         use_sample_covariance=False, data_range=1.0, channel_axis=-1,
@@ -100,8 +93,8 @@ def test_inside_the_mask_a_rectangle_equals_the_crop(seed, top, bottom, left, ri
     assert ssim(preds, target, mask, data_range=1.0, convention="inside_mask") == pytest.approx(cut, abs=1e-9)
 
 
-def test_all_but_map_mean_ignore_what_is_masked_out():
-    preds, target, mask = _pattern()
+def test_all_but_map_mean_ignore_what_is_masked_out(pattern):
+    preds, target, mask = (*pattern, DISC)
     for convention in SSIM_CONVENTIONS:
         wanted = ssim(preds, target, mask, data_range=1.0, convention=convention)
         spoilt = np.where(mask[..., None], preds, np.nan)
@@ -114,8 +107,8 @@ def test_all_but_map_mean_ignore_what_is_masked_out():
             ssim(np.full_like(preds, np.nan), target, mask, data_range=1.0, convention=convention)
 
 
-def test_no_two_conventions_agree_under_a_mask_and_inner_windows_agree_without():
-    preds, target, mask = _pattern()
+def test_no_two_conventions_agree_under_a_mask_and_inner_windows_agree_without(pattern):
+    preds, target, mask = (*pattern, DISC)
     found = [ssim(preds, target, mask, data_range=1.0, convention=name) for name in SSIM_CONVENTIONS]
     assert len(found) == len({round(value, 4) for value in found}) == 5
     full = np.ones_like(mask)
@@ -125,8 +118,8 @@ def test_no_two_conventions_agree_under_a_mask_and_inner_windows_agree_without()
 
 
 @pytest.mark.parametrize("convention", SSIM_CONVENTIONS)
-def test_identity_and_the_empty_mask(convention):
-    preds, target, mask = _pattern()
+def test_identity_and_the_empty_mask(pattern, convention):
+    preds, target, mask = (*pattern, DISC)
     assert ssim(target, target, mask, data_range=1.0, convention=convention) == pytest.approx(1)
     assert np.isnan(ssim(preds, target, np.zeros_like(mask), data_range=1.0, convention=convention))
 

@@ -6,8 +6,8 @@ from hypothesis import strategies as st
 from unghost.core.channels import (
     CHANNEL_NAMES,
     UNKNOWN,
+    encode_share,
     encode_surroundings,
-    encode_transmittance,
     encode_view_count,
     full_channel,
 )
@@ -181,7 +181,7 @@ def test_all_channels_and_the_labels_move_together(shard_paths):
             scale_depth(dequantize_signed(shard.inputs[draw.cube]), draw.depth),
             full_channel(encode_surroundings(coarse)),
             encode_view_count(shard.view_count[draw.cube]),
-            full_channel(encode_transmittance((shard.transmittance[draw.cube] / np.float32(255)) ** draw.depth)),
+            full_channel(encode_share((shard.transmittance[draw.cube] / np.float32(255)) ** draw.depth)),
         ]
         assert len(expected) == len(CHANNEL_NAMES)
         for found, grid in zip(batch.channels[row], expected):

@@ -9,8 +9,8 @@ from unghost.core.channels import (
     CHANNEL_NAMES,
     UNKNOWN,
     coarse_channel,
+    encode_share,
     encode_surroundings,
-    encode_transmittance,
     encode_view_count,
 )
 from unghost.core.cube_views import count_views
@@ -91,7 +91,7 @@ def test_light_of_windows_is_that_of_cubes(crowd, aabb):
     found = context.known(CORNERS)["transmittance"]
     centers, edges = windows(CORNERS, origin, 0.05)
     lattice = cube_lattices(centers, edges, None, resolution=16)
-    np.testing.assert_allclose(found, encode_transmittance(maps.best_view(lattice)), atol=1e-6)
+    np.testing.assert_allclose(found, encode_share(maps.best_view(lattice)), atol=1e-6)
     assert found.std() > 0.05
     assert len(context._light_tiles) <= 3 * 8
 

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from unghost import cli
-from unghost.core.manifest import CHANNEL_NAMES, FORMAT, METADATA_KEY, Manifest
+from unghost.core.channels import CHANNEL_NAMES
+from unghost.core.manifest import FORMAT, METADATA_KEY, Manifest
 from unghost.core.shards import ARRAYS
 from unghost.core.shards import FORMAT as SHARD_FORMAT
 
