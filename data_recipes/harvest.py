@@ -10,8 +10,8 @@ from __future__ import annotations
 import dataclasses
 import os
 import time
-from collections.abc import Callable, Sequence
-from contextlib import closing
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -51,6 +51,19 @@ if TYPE_CHECKING:
 OBSERVER_STREAM = 0x6F6273  # keeps the other sweep apart from all else
 EARLY = 0.45  # share of the fit at which the first cubes are taken
 TOGETHER, QUERY = 8, 1 << 17  # cubes, and points in them, that are worked on at a time
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """torch in one thread: gradients summed in several differ from run to run in their last bits."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _density_fn(field: TrainableField) -> Callable[[NDArray[Any]], NDArray[np.float32]]:
@@ -139,6 +152,7 @@ def _draw_field(rng: np.random.Generator, config: HarvestConfig) -> tuple[str, i
     return kind, resolution, make_field(kind, resolution, initial_opacity=opacity, seed=int(rng.integers(2**31)))
 
 
+@_one_thread()
 def harvest_scene(
     seed: int, index: int, config: HarvestConfig, mesh_root: str | Path | None = None
 ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
@@ -213,10 +227,6 @@ def _work(
     if target.exists():  # made by a call whose answer was lost with another worker
         return index, ""
     try:
-        if fit:
-            import torch
-
-            torch.set_num_threads(1)
         arrays, provenance = (harvest_scene if fit else room_scene)(seed, index, config, mesh_root)
     except (RuntimeError, FloatingPointError) as error:  # no free path, a failed fit: reported, not fatal
         return index, str(error)
