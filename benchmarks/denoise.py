@@ -15,7 +15,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import tyro
@@ -23,19 +23,19 @@ from classical import Classical
 from denoise_figure import draw
 from denoise_scores import score
 from denoise_sets import MIXED, SEED, SEVERITIES, CubeSet, capture_set, harvest_set, mesh_sets
+from denoise_speed import UNTRAINED, Model, speed_row, untrained_rows
 from fit_cache import file_hash, say
 from numpy.typing import NDArray
 
 from unghost import load_denoiser
-from unghost.bench import measure_speed
 from unghost.core.arrays import to_numpy
 from unghost.core.channels import encode_known, stack_channels
 from unghost.core.results import build_results, write_results
 from unghost.core.shards import dequantize_share, dequantize_signed
 
 ROOT = Path(__file__).resolve().parents[1]
+WEIGHTS = ROOT / "unghost" / "weights"
 TIMESTEPS = (100, 300, 500, 700, 999)
-BATCH, SPEED_SECONDS = 40, 8.0
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,8 @@ class Options:
         models: of those to compare, NAME=FILE (.onnx or .safetensors); ``unghost`` is the shipped one.
         cubes: of each set; a tenth as many of each single family of corruption and severity.
         threads: of onnxruntime and torch, for the speed.
-        timesteps: also score all sets at these (a row each, named NAME@t): for diffusion models.
+        timesteps: of diffusions, also score all sets at these (a row each, named NAME@t).
+        untrained: of ``denoise_speed.UNTRAINED``: networks that have no weights, for a row with their speed.
         out: where denoise.json and denoise.png go.
         cache: where the capture's fields and cubes are kept.
     """
@@ -63,6 +64,7 @@ class Options:
     cubes: int = 400
     threads: int = 2
     timesteps: tuple[int, ...] = ()
+    untrained: tuple[Literal[UNTRAINED], ...] = ()  # type: ignore[valid-type]
     out: Path = ROOT / "docs" / "results"
     cache: Path = ROOT / "out" / "capture"
 
@@ -74,7 +76,9 @@ class Options:
             parts += [f"--{name} {folder.resolve().name}"] if folder else []
         named = [f"{name}={Path(file).name}" for name, file in self.named()]
         parts += [f"--models {' '.join(named)}"] if self.models != ("unghost=default",) else []
-        parts += [f"--timesteps {' '.join(map(str, self.timesteps))}"] if self.timesteps else []
+        for name in ("timesteps", "untrained"):
+            values = getattr(self, name)
+            parts += [f"--{name} {' '.join(map(str, values))}"] if values else []
         return " ".join(parts)
 
     def named(self) -> list[tuple[str, str]]:
@@ -103,11 +107,12 @@ def predict(denoiser: Any, cubes: CubeSet, rows: NDArray[np.int64], timestep: in
     return result
 
 
-def row_of(name: str, denoiser: Any, cubes: CubeSet, timestep: int) -> dict[str, Any]:
-    """Scores of one method on one set."""
+def row_of(name: str, denoiser: Any, cubes: CubeSet, timestep: int, *, seen: CubeSet | None = None) -> dict[str, Any]:
+    """Scores of one method on one set; ``seen`` is that set as the denoiser is shown it, if in another form."""
+    shown = seen or cubes
 
     def ask(rows: NDArray[np.int64]) -> NDArray[np.float32]:
-        return predict(denoiser, cubes, rows, timestep)
+        return predict(denoiser, shown, rows, timestep)
 
     found = score(ask, cubes.signed, cubes.labels, cubes.group)
     return {"method": name, "set": cubes.name, **cubes.about, "timestep": timestep, **found}
@@ -139,51 +144,59 @@ def all_sets(options: Options) -> list[CubeSet]:
     return sets
 
 
-def speed_row(name: str, file: str, denoiser: Any, threads: int) -> dict[str, Any]:
-    """Cubes a second, and how large the model is."""
-    manifest = denoiser.manifest
+def variants_of(name: str, denoiser: Any, timesteps: tuple[int, ...]) -> list[tuple[str, Any, int]]:
+    """Ways to use a model: name, denoiser, timestep. A diffusion also at other timesteps, as the paper does it
+    (the cube stands for xt), and, in torch, with the noise of the timestep added first."""
+    found = [(name, denoiser, denoiser.manifest.default_timestep)]
+    if denoiser.manifest.family != "diffusion":
+        return found
+    found += [(f"{name}@{step}", denoiser, step) for step in timesteps]
     if denoiser.kind == "torch":
         import torch
 
-        torch.set_num_threads(threads)
-    speed = measure_speed(denoiser, batch=BATCH, seconds=SPEED_SECONDS)
-    path = ROOT / "unghost" / "weights" / f"{file}.onnx" if "." not in file else Path(file)
-    size = {"megabytes": path.stat().st_size / 1e6} if path.is_file() else {}
-    return {
-        "method": name, "set": "speed", "runtime": "torch" if denoiser.kind == "torch" else "onnxruntime",
-        "threads": threads, "parameters": manifest.parameters, "gflop": manifest.training.get("gflop"),
-        "channels": list(manifest.channels), **size, **speed,
-    }  # fmt: skip
+        from unghost.prior.noised_denoiser import NoisedDenoiser
+
+        noised = NoisedDenoiser(denoiser, torch.Generator().manual_seed(SEED))
+        found += [(f"{name}+noise@{step}", noised, step) for step in timesteps]
+    return found
 
 
 def measure(options: Options) -> dict[str, Any]:
     """Everything; the file grows with every method."""
-    methods = [(name, name, Classical(name)) for name in Classical.names()]
-    methods += [(name, file, load_denoiser(file, threads=options.threads)) for name, file in options.named()]
-    sets, rows = all_sets(options), list[dict[str, Any]]()
+    methods = [(name, Classical(name)) for name in Classical.names()]
+    methods += [(name, load_model(file, options.threads)) for name, file in options.named()]
+    sets, rows = all_sets(options), untrained_rows(options.untrained, options.threads)
     say(f"{sum(map(len, sets))} cubes in {len(sets)} sets, {len(methods)} methods")
     results: dict[str, Any] = {}
-    for name, file, denoiser in methods:
-        learned = not isinstance(denoiser, Classical)
-        variants = [(name, denoiser.manifest.default_timestep)]
-        variants += [(f"{name}@{step}", step) for step in options.timesteps if learned]
-        for variant, timestep in variants:
+    files = dict(options.named())
+    priors = {name: file_hash(file) if "." in file else load_denoiser(file).manifest.body_sha256
+              for name, file in files.items()}  # fmt: skip
+    for name, denoiser in methods:
+        for variant, used, timestep in variants_of(name, denoiser, options.timesteps):
             for cubes in sets:
-                row = row_of(variant, denoiser, cubes, timestep)
-                if learned and cubes.about.get("family") == MIXED:
-                    row = with_best_timestep(row, variant, denoiser, cubes)
+                row = row_of(variant, used, cubes, timestep)
+                if name in files and cubes.about.get("family") == MIXED:
+                    row = with_best_timestep(row, variant, used, cubes)
                 rows.append(row)
             rows.append(mean_over_severities(rows, variant))
             say(_headline(rows, variant))
-        if learned:
-            rows.append(speed_row(name, file, denoiser, options.threads))
-        priors = {name: file_hash(file) if "." in file else load_denoiser(file).manifest.body_sha256
-                  for name, file in options.named()}  # fmt: skip
+        if name in files:
+            rows.append(speed_row(Model.of(name, files[name], WEIGHTS), options.threads))
         results = build_results(
             rows, command=options.command(), seeds=[SEED], priors=priors, severities=list(SEVERITIES)
         )
         write_results(options.out / "denoise.json", results)
     return results
+
+
+def load_model(file: str, threads: int) -> Any:
+    """A denoiser by name or file; the number of threads is onnxruntime's or torch's."""
+    if not file.endswith(".safetensors"):
+        return load_denoiser(file, threads=threads)
+    import torch
+
+    torch.set_num_threads(threads)
+    return load_denoiser(file)
 
 
 def _headline(rows: list[dict[str, Any]], method: str) -> str:

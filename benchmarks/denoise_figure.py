@@ -38,7 +38,7 @@ def draw(path: Path, rows: Sequence[dict[str, Any]]) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
-    speeds = {row["method"]: row["cubes_per_second"] for row in rows if row["set"] == "speed"}
+    speeds = {row["method"]: row["cubes_per_second"] for row in rows if "cubes_per_second" in row}
     names = list(dict.fromkeys(row["method"] for row in rows))
     figure, axes = plt.subplots(1, len(PANELS), figsize=(17, 5.2), constrained_layout=True)
     for axis, (name, key, heading) in zip(axes, PANELS):

@@ -22,14 +22,17 @@ def parts():
     sys.path.insert(0, str(BENCHMARKS))
     try:
         import capture_cubes
+        import channels_study
         import classical
+        import denoise
         import denoise_figure
         import denoise_scores
         import denoise_sets
+        import denoise_speed
 
         yield {
             "classical": classical, "scores": denoise_scores, "sets": denoise_sets, "figure": denoise_figure,
-            "capture": capture_cubes,
+            "capture": capture_cubes, "denoise": denoise, "speed": denoise_speed, "study": channels_study,
         }  # fmt: skip
     finally:
         sys.path.remove(str(BENCHMARKS))
@@ -137,6 +140,79 @@ def test_damage_repeats_and_grows(parts):
     assert 0 < changed[0] < changed[1]
     assert low.about == {"family": "salt", "severity": 0.1}
     assert len(clean.first(0)) == 0
+
+
+def test_what_is_timed_of_a_model(parts, tmp_path):
+    """A file is timed with what lies beside it, but an int8 file's checkpoint is another model."""
+    for name in ("a.onnx", "a.safetensors", "b.safetensors", "a.int8.onnx", "shipped.onnx"):
+        (tmp_path / name).touch()
+    of = parts["speed"].Model.of
+    for file, onnx, checkpoint in (
+        ("a.onnx", "a.onnx", "a.safetensors"),
+        ("a.safetensors", "a.onnx", "a.safetensors"),
+        ("a.int8.onnx", "a.int8.onnx", None),
+        ("b.safetensors", None, "b.safetensors"),
+    ):
+        model = of("x", str(tmp_path / file), tmp_path)
+        found = [path and path.name for path in (model.scored, model.onnx, model.checkpoint)]
+        assert found == [file, onnx, checkpoint]
+    assert of("x", "shipped", tmp_path).onnx == tmp_path / "shipped.onnx"
+
+
+def test_a_network_without_weights_has_a_speed_and_says_so(parts, monkeypatch):
+    monkeypatch.setattr(parts["speed"], "SECONDS", 0.01)
+    monkeypatch.setattr(parts["speed"], "BATCH", 1)
+    (row,) = parts["speed"].untrained_rows(("l",), 1)
+    assert (row["method"], row["set"], row["trained"]) == ("l", "speed", False)
+    assert row["cubes_per_second"] > 0
+    assert row["torch_cubes_per_second"] > 0
+    assert row["parameters"] > 1e6
+    assert not any(key.startswith(("iou", "ghosts")) for key in row)
+
+
+def test_a_diffusion_is_asked_in_more_ways_than_a_restoration(parts):
+    from unghost.core.manifest import Manifest
+
+    class Model:
+        kind = "numpy"
+
+        def __init__(self, family):
+            self.manifest = Manifest("m", family=family, default_timestep=50)
+
+    ways = parts["denoise"].variants_of
+    assert [way[0] for way in ways("r", Model("restoration"), (10, 200))] == ["r"]
+    assert [(way[0], way[2]) for way in ways("d", Model("diffusion"), (10, 200))] == [
+        ("d", 50), ("d@10", 10), ("d@200", 200),
+    ]  # fmt: skip
+
+
+def test_the_study_shows_bits_where_it_says_so_and_keeps_the_truth(parts, tmp_path):
+    from unghost.core.occupancy import opacity_from_signed
+    from unghost.core.shards import dequantize_signed, pack_labels, read_shard, write_shard
+
+    rng = np.random.default_rng(0)
+    arrays = {
+        "inputs": rng.integers(0, 256, (3, 32, 32, 32), dtype=np.uint8),
+        "labels": pack_labels(rng.integers(0, 3, (3, 32, 32, 32)).astype(np.uint8)),
+        "severity": np.float32([0.1, 0.2, 0.3]), "edge_fraction": np.full(3, 0.1, np.float32),
+        "group": np.arange(3, dtype=np.int32), "view_count": rng.integers(0, 9, (3, 32, 32, 32), dtype=np.uint8),
+    }  # fmt: skip
+    write_shard(tmp_path / "shard", arrays, {"recipe": "harvest"})
+    study = parts["study"]
+    ((path, weight),) = study.bit_shards([(str(tmp_path / "shard"), 0.5)], tmp_path / "bits")
+    bits = read_shard(path, verify=True)
+    assert weight == 0.5
+    assert bits.provenance["recipe"] == "harvest"  # the trainer weighs harvested cubes by that
+    assert set(np.unique(bits.inputs)) == {0, 255}
+    opaque = opacity_from_signed(dequantize_signed(arrays["inputs"])) > 0.1
+    np.testing.assert_array_equal(np.array(bits.inputs) == 255, opaque)
+    np.testing.assert_array_equal(bits.labels, arrays["labels"])
+    assert bits.view_count is None
+    cubes = parts["sets"].from_shards("harvest", [read_shard(tmp_path / "shard")], 3)
+    assert cubes.view_count is not None
+    np.testing.assert_array_equal(study.seen(cubes, study.BIT).signed > 0, opaque)
+    assert study.seen(cubes, "opacity") is cubes
+    assert study.blind(cubes).view_count is None
 
 
 def test_pseudo_truth_goes_by_the_votes_of_the_photos(parts):

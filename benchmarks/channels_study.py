@@ -1,0 +1,188 @@
+"""What should the network see? The same network, data, steps and seed, with more and more channels; one table.
+
+    python benchmarks/channels_study.py out/procedural=.25 out/meshes=.25 out/harvest=.5 --runs out/channels \\
+        --meshes MESHES --harvest out/harvest-val --unseen out/harvest-mlp --capture CAPTURE
+
+A bit (opacity over .1), the opacity, then surroundings, view counts and transmittance on top. Each is trained from
+scratch and scored on the sets of ``denoise.py``; what has optional channels is scored once more with all of them
+unknown (``blind``). Training resumes where it was killed. Writes docs/results/channels.json.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from denoise import Options as Measurement
+from denoise import all_sets, mean_over_severities, row_of
+from denoise_sets import MIXED, CubeSet
+from fit_cache import say
+
+from unghost import load_denoiser
+from unghost.commands_prior import expand_shards
+from unghost.core.channels import CHANNEL_NAMES, SIGNED_OPACITY, SURROUNDINGS, TRANSMITTANCE, VIEW_COUNT
+from unghost.core.occupancy import DEFAULT_OPACITY_THRESHOLD, opacity_from_signed, signed_from_occupancy
+from unghost.core.results import build_results, write_results
+from unghost.core.shards import Shard, dequantize_signed, quantize_signed, read_shard, write_shard
+from unghost.prior.config import TrainConfig
+from unghost.prior.network import SIZES
+from unghost.prior.train import train
+
+ROOT = Path(__file__).resolve().parents[1]
+FOG = ("harvest", "harvest-unseen-field", "capture")
+BIT = "a bit"
+VARIANTS: dict[str, tuple[str, ...]] = {
+    BIT: (SIGNED_OPACITY,),
+    "opacity": (SIGNED_OPACITY,),
+    "opacity, surroundings": (SIGNED_OPACITY, SURROUNDINGS),
+    "opacity, surroundings, views": (SIGNED_OPACITY, SURROUNDINGS, VIEW_COUNT),
+    "opacity, views": (SIGNED_OPACITY, VIEW_COUNT),
+    "opacity, views, transmittance": (SIGNED_OPACITY, VIEW_COUNT, TRANSMITTANCE),
+    "opacity, surroundings, views, transmittance": CHANNEL_NAMES,
+}
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to train on and to measure.
+
+    Attributes:
+        shards: FOLDER or FOLDER=WEIGHT, as ``unghost train`` takes them.
+        runs: folder of the runs, one a variant.
+        meshes: folder of meshes with a manifest.csv.
+        harvest: folder of harvested shards of scenes that are not trained on.
+        unseen: the same of a kind of field that is not trained on.
+        capture: folder of a real capture.
+        steps: of each run.
+        batch_size: cubes a step.
+        size: of the network: xs, s, m or l.
+        seed: of the weights and of the stream of samples.
+        cubes: of each set.
+        threads: of torch.
+        out: where channels.json goes.
+        cache: where the capture's fields and cubes are kept.
+    """
+
+    shards: tyro.conf.Positional[tuple[str, ...]]
+    meshes: Path
+    runs: Path = ROOT / "out" / "channels"
+    harvest: Path | None = None
+    unseen: Path | None = None
+    capture: Path | None = None
+    steps: int = 2500
+    batch_size: int = 48
+    size: str = "s"
+    seed: int = 0
+    cubes: int = 200
+    threads: int = 2
+    out: Path = ROOT / "docs" / "results"
+    cache: Path = ROOT / "out" / "capture"
+
+    def command(self) -> str:
+        """Without anybody's paths."""
+        shards = " ".join(Path(spec).name for spec in self.shards)
+        sets = "".join(f" --{name} {getattr(self, name).resolve().name}" for name in ("harvest", "unseen", "capture")
+                       if getattr(self, name))  # fmt: skip
+        return (
+            f"python benchmarks/channels_study.py {shards} --meshes {self.meshes.name}{sets} --steps {self.steps} "
+            f"--batch-size {self.batch_size} --size {self.size} --cubes {self.cubes}"
+        )
+
+
+def as_bits(signed: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """Signed opacity to -1 or +1 by the opacity threshold."""
+    return signed_from_occupancy(opacity_from_signed(signed) > DEFAULT_OPACITY_THRESHOLD)
+
+
+def bit_shards(shards: Iterable[tuple[str, float]], folder: Path) -> list[tuple[str, float]]:
+    """The same shards with inputs made bits, and with nothing about the cubes."""
+    made = []
+    for number, (source, weight) in enumerate(shards):
+        target = folder / f"{number:05d}"
+        if not (target / "manifest.json").exists():
+            shard = read_shard(source)
+            inputs = quantize_signed(as_bits(dequantize_signed(np.array(shard.inputs))))
+            write_shard(target, {"inputs": inputs, **_untouched(shard)}, shard.provenance)
+        made.append((str(target), weight))
+    return made
+
+
+def _untouched(shard: Shard) -> dict[str, Any]:
+    return {name: np.array(getattr(shard, name)) for name in ("labels", "severity", "edge_fraction", "group")}
+
+
+def seen(cubes: CubeSet, variant: str) -> CubeSet:
+    """The set as a variant is shown it; scores are of the original one."""
+    return dataclasses.replace(cubes, signed=as_bits(cubes.signed)) if variant == BIT else cubes
+
+
+def blind(cubes: CubeSet) -> CubeSet:
+    """The set with every optional channel unknown."""
+    return dataclasses.replace(cubes, surroundings=None, view_count=None, transmittance=None)
+
+
+def trained(variant: str, options: Options, shards: Sequence[tuple[str, float]]) -> Path:
+    """The model of a variant, trained unless it is there."""
+    folder = options.runs / variant.replace(" ", "-").replace(",", "")
+    model = folder / "model.safetensors"
+    if not model.exists():
+        network = dataclasses.replace(SIZES[options.size], channels=VARIANTS[variant])
+        config = TrainConfig(
+            name=f"study {variant}", network=network, steps=options.steps, batch_size=options.batch_size,
+            seed=options.seed, threads=options.threads, validate_seconds=0.0,
+        )  # fmt: skip
+        used = bit_shards(shards, options.runs / "bits") if variant == BIT else shards
+        train(config, train_shards=used, out=folder, resume=folder.exists())
+    return model
+
+
+def rows_of(variant: str, model: Path, sets: Sequence[CubeSet]) -> list[dict[str, Any]]:
+    """Scores of a variant, and of the same one blind."""
+    denoiser = load_denoiser(model)
+    about = {"channels": list(VARIANTS[variant]), "parameters": denoiser.manifest.parameters}
+    ways = [(variant, lambda cubes: cubes)]
+    if len(VARIANTS[variant]) > 1:
+        ways.append((f"{variant}, blind", blind))
+    rows: list[dict[str, Any]] = []
+    for name, shown in ways:
+        for cubes in sets:
+            known = shown(cubes)
+            row = row_of(name, denoiser, known, denoiser.manifest.default_timestep, seen=seen(known, variant))
+            rows.append({**row, **about})
+        rows.append({**mean_over_severities(rows, name), **about})
+    return rows
+
+
+def wanted_sets(options: Options) -> list[CubeSet]:
+    """The sets of the reference measurement, single families of corruption aside."""
+    measurement = Measurement(
+        meshes=options.meshes, harvest=options.harvest, unseen=options.unseen, capture=options.capture,
+        cubes=options.cubes, cache=options.cache,
+    )  # fmt: skip
+    return [cubes for cubes in all_sets(measurement) if cubes.about.get("family", MIXED) == MIXED]
+
+
+def main() -> None:
+    options = tyro.cli(Options, description=__doc__)
+    options = dataclasses.replace(options, meshes=options.meshes.resolve())
+    shards = [pair for spec in options.shards for pair in expand_shards(spec)]
+    models = {variant: trained(variant, options, shards) for variant in VARIANTS}
+    sets, rows = wanted_sets(options), list[dict[str, Any]]()
+    for variant, model in models.items():
+        rows += rows_of(variant, model, sets)
+        fog = [f"{row['set']} {row['ghosts_removed_98']:.3f}" for row in rows
+               if row["method"] == variant and row["set"] in FOG]  # fmt: skip
+        say(f"{variant:46s} {'  '.join(fog)}")
+        write_results(options.out / "channels.json", build_results(
+            rows, command=options.command(), seeds=[options.seed], size=options.size, steps=options.steps,
+            batch_size=options.batch_size,
+        ))  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
