@@ -27,8 +27,9 @@ from unghost import load_denoiser
 from unghost.commands_prior import expand_shards
 from unghost.core.channels import CHANNEL_NAMES, SIGNED_OPACITY, SURROUNDINGS, TRANSMITTANCE, VIEW_COUNT
 from unghost.core.occupancy import DEFAULT_OPACITY_THRESHOLD, opacity_from_signed, signed_from_occupancy
+from unghost.core.packing import dequantize_signed, quantize_signed
 from unghost.core.results import build_results, write_results
-from unghost.core.shards import Shard, dequantize_signed, quantize_signed, read_shard, write_shard
+from unghost.core.shards import Shard, read_shard, write_shard
 from unghost.prior.config import TrainConfig
 from unghost.prior.network import SIZES
 from unghost.prior.train import train

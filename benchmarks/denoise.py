@@ -30,8 +30,8 @@ from numpy.typing import NDArray
 from unghost import load_denoiser
 from unghost.core.arrays import to_numpy
 from unghost.core.channels import encode_known, stack_channels
+from unghost.core.packing import dequantize_share, dequantize_signed
 from unghost.core.results import build_results, write_results
-from unghost.core.shards import dequantize_share, dequantize_signed
 
 ROOT = Path(__file__).resolve().parents[1]
 WEIGHTS = ROOT / "unghost" / "weights"

@@ -14,7 +14,8 @@ from capture_cubes import capture_shards, cubes_folder
 from numpy.typing import NDArray
 
 from unghost.core.occupancy import FREE_LABEL, SURFACE_LABEL, signed_from_occupancy
-from unghost.core.shards import Shard, dequantize_signed, read_shard, unpack_labels
+from unghost.core.packing import dequantize_signed, unpack_labels
+from unghost.core.shards import Shard, read_shard
 from unghost.data_recipes.augment import CORRUPTIONS, corrupt
 from unghost.data_recipes.curate import curate
 from unghost.data_recipes.preview import find_shards

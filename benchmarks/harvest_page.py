@@ -20,7 +20,8 @@ import tyro
 from numpy.typing import NDArray
 
 from unghost.core.occupancy import FREE_LABEL, SURFACE_LABEL, opacity_from_signed
-from unghost.core.shards import Shard, dequantize_signed, read_shard, unpack_labels, write_shard
+from unghost.core.packing import dequantize_signed, unpack_labels
+from unghost.core.shards import Shard, read_shard, write_shard
 from unghost.data_recipes.harvest_config import HarvestConfig
 from unghost.data_recipes.preview import draw_pair, find_shards
 from unghost.data_recipes.render import GHOST, SURFACE, UNJUDGED

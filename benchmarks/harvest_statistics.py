@@ -26,8 +26,9 @@ from capture_cubes import capture_shards, cubes_folder
 from fit_cache import say
 
 from unghost.core.occupancy import signed_from_occupancy
+from unghost.core.packing import quantize_signed
 from unghost.core.results import build_results, write_results
-from unghost.core.shards import quantize_signed, read_shard
+from unghost.core.shards import read_shard
 from unghost.data_recipes.augment import CORRUPTIONS
 from unghost.data_recipes.curate import curate
 from unghost.data_recipes.harvest import harvest

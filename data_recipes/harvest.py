@@ -23,17 +23,15 @@ from ..core.channels import full_channel
 from ..core.cube_views import count_views
 from ..core.frames import RESOLUTION, cube_lattices, random_rotations
 from ..core.occupancy import DEFAULT_OPACITY_THRESHOLD, opacity_from_density, opacity_from_signed
-from ..core.shards import (
-    TRANSMITTANCE_RESOLUTION,
+from ..core.packing import (
     dequantize_share,
     dequantize_signed,
     pack_labels,
     quantize_share,
     quantize_signed,
-    read_shard,
     unpack_labels,
-    write_shard,
 )
+from ..core.shards import TRANSMITTANCE_RESOLUTION, read_shard, write_shard
 from ..core.transmittance import TransmittanceMaps
 from .engines import LocalEngine
 from .folder_lock import locked

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..core.aabb import scene_extent
 from ..core.frames import RESOLUTION, CubeFrame, random_rotations
-from ..core.shards import pack_labels, quantize_signed
+from ..core.packing import pack_labels, quantize_signed
 from .harvest_config import HarvestConfig
 from .harvest_labels import Geometry
 

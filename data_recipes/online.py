@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.shards import dequantize_signed, unpack_labels
+from ..core.packing import dequantize_signed, unpack_labels
 from .engines import LocalEngine, spans
 from .pairs import Chunk, checked_root, close_meshes, make_chunk
 from .recipe import Recipe

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from ..core.frames import CubeFrame
 from ..core.occupancy import FREE_LABEL, IGNORE_LABEL, SURFACE_LABEL, signed_from_occupancy
-from ..core.shards import ARRAYS, OPTIONAL_ARRAYS, pack_frame, pack_labels, quantize_signed
+from ..core.packing import pack_frame, pack_labels, quantize_signed
+from ..core.shards import ARRAYS, OPTIONAL_ARRAYS
 from .augment import corrupt, soften
 from .compose import dilate, sample_cube
 from .engines import spans

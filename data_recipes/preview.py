@@ -19,7 +19,8 @@ from ..core.occupancy import (
     SURFACE_LABEL,
     opacity_from_signed,
 )
-from ..core.shards import Shard, dequantize_signed, read_shard, unpack_labels
+from ..core.packing import dequantize_signed, unpack_labels
+from ..core.shards import Shard, read_shard
 from .preview_page import page_text
 from .render import GHOST, MISSING, SURFACE, UNJUDGED, Image, best_turn, render_cube
 from .statistics import (

@@ -42,7 +42,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core.frames import RESOLUTION
 from ..core.occupancy import DEFAULT_OPACITY_THRESHOLD, FREE_LABEL, IGNORE_LABEL, SURFACE_LABEL, opacity_from_signed
-from ..core.shards import Shard, dequantize_signed, quantize_signed, read_shard, unpack_labels
+from ..core.packing import dequantize_signed, quantize_signed, unpack_labels
+from ..core.shards import Shard, read_shard
 from .thickness import local_thickness
 
 Values = NDArray[np.float64]

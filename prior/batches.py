@@ -28,8 +28,9 @@ from ..core.channels import (
     encode_known,
     stack_channels,
 )
+from ..core.packing import dequantize_share, dequantize_signed, unpack_labels
 from ..core.schedule import timestep_from_severity
-from ..core.shards import Shard, dequantize_share, dequantize_signed, read_shard, unpack_labels
+from ..core.shards import Shard, read_shard
 
 SYMMETRIES: tuple[tuple[tuple[int, ...], tuple[int, ...]], ...] = tuple(
     (permutation, tuple(axis for axis in range(3) if flips >> axis & 1))

@@ -21,7 +21,8 @@ from ..core.occupancy import (
     SURFACE_LABEL,
     opacity_from_signed,
 )
-from ..core.shards import Shard, unpack_labels
+from ..core.packing import unpack_labels
+from ..core.shards import Shard
 from .batches import stored_channels
 
 HISTOGRAM_BINS = 2048  # over [-1, 1]: thresholds are exact to 1/1024

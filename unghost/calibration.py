@@ -61,7 +61,7 @@ def _stored(folder: Path, cubes: int, names: tuple[str, ...]) -> tuple[np.ndarra
 def _made(recipe: str | Path, cubes: int, seed: int, names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Channels (optional ones unknown) and edge fractions of the first cubes of a recipe."""
     from .core.channels import stack_channels
-    from .core.shards import dequantize_signed
+    from .core.packing import dequantize_signed
     from .data_recipes.pairs import make_chunk
     from .data_recipes.recipe import load_recipe
 

@@ -9,17 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from unghost.core.frames import CubeFrame, random_rotations
-from unghost.core.shards import (
+from unghost.core.packing import (
     dequantize_signed,
     pack_frame,
     pack_labels,
     quantize_signed,
-    read_shard,
-    stays_within,
     unpack_frame,
     unpack_labels,
-    write_shard,
 )
+from unghost.core.shards import read_shard, stays_within, write_shard
 
 
 def test_labels_by_hand():

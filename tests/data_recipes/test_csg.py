@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from unghost.core.frames import CubeFrame
-from unghost.core.shards import pack_frame
+from unghost.core.packing import pack_frame
 from unghost.data_recipes import csg
 from unghost.data_recipes.crops import cut_cubes
 from unghost.data_recipes.csg import (

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from unghost.core.occupancy import FREE_LABEL, IGNORE_LABEL, SURFACE_LABEL
-from unghost.core.shards import ARRAYS, dequantize_signed, pack_frame, read_shard, unpack_frame, unpack_labels
+from unghost.core.packing import dequantize_signed, pack_frame, unpack_frame, unpack_labels
+from unghost.core.shards import ARRAYS, read_shard
 from unghost.data_recipes.compose import sample_cube
 from unghost.data_recipes.curate import curate, damage, sample_pair
 from unghost.data_recipes.recipe import Recipe, load_recipe

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from unghost.core.occupancy import SURFACE_LABEL
-from unghost.core.shards import dequantize_signed, read_shard, unpack_frame, unpack_labels
+from unghost.core.packing import dequantize_signed, unpack_frame, unpack_labels
+from unghost.core.shards import read_shard
 from unghost.data_recipes.curate import SampleError, curate, sample_pair
 from unghost.data_recipes.mesh_files import load_mesh
 from unghost.data_recipes.meshes import Mesh

@@ -12,7 +12,8 @@ from unghost.core.aabb import contains
 from unghost.core.cube_views import count_views
 from unghost.core.frames import cube_lattices
 from unghost.core.occupancy import FREE_LABEL, IGNORE_LABEL, opacity_from_density
-from unghost.core.shards import dequantize_signed, read_shard, unpack_frame, unpack_labels
+from unghost.core.packing import dequantize_signed, unpack_frame, unpack_labels
+from unghost.core.shards import read_shard
 from unghost.data_recipes import harvest as module
 from unghost.data_recipes import harvest_config
 from unghost.data_recipes.harvest import harvest, harvest_scene, room_scene

@@ -7,7 +7,8 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from unghost.core.shards import dequantize_signed, read_shard, unpack_labels
+from unghost.core.packing import dequantize_signed, unpack_labels
+from unghost.core.shards import read_shard
 from unghost.data_recipes.curate import SampleError, curate
 from unghost.data_recipes.online import OnlinePairs, PairBatch
 from unghost.data_recipes.recipe import Recipe, load_recipe

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from unghost import cli
-from unghost.core.shards import Shard, pack_labels, quantize_signed, read_shard, write_shard
+from unghost.core.packing import pack_labels, quantize_signed
+from unghost.core.shards import Shard, read_shard, write_shard
 from unghost.data_recipes.curate import curate
 from unghost.data_recipes.preview import draw_pair, find_shards, sources_of, write_preview
 from unghost.data_recipes.preview_page import histogram

@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from scipy.stats import wasserstein_distance
 
 from unghost.core.occupancy import signed_from_occupancy
-from unghost.core.shards import pack_labels, quantize_signed, write_shard
+from unghost.core.packing import pack_labels, quantize_signed
+from unghost.core.shards import write_shard
 from unghost.data_recipes.augment import CORRUPTIONS
 from unghost.data_recipes.compose import sample_cube
 from unghost.data_recipes.recipe import Recipe

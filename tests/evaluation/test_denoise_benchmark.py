@@ -188,7 +188,8 @@ def test_a_diffusion_is_asked_in_more_ways_than_a_restoration(parts):
 
 def test_the_study_shows_bits_where_it_says_so_and_keeps_the_truth(parts, tmp_path):
     from unghost.core.occupancy import opacity_from_signed
-    from unghost.core.shards import dequantize_signed, pack_labels, read_shard, write_shard
+    from unghost.core.packing import dequantize_signed, pack_labels
+    from unghost.core.shards import read_shard, write_shard
 
     rng = np.random.default_rng(0)
     arrays = {

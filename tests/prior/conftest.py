@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from unghost.core.frames import unit_lattice
-from unghost.core.shards import pack_labels, quantize_signed, write_shard
+from unghost.core.packing import pack_labels, quantize_signed
+from unghost.core.shards import write_shard
 from unghost.prior.config import TrainConfig
 from unghost.prior.network import NetworkConfig
 

@@ -11,7 +11,8 @@ from unghost.core.channels import (
     encode_view_count,
     full_channel,
 )
-from unghost.core.shards import dequantize_signed, read_shard, unpack_labels, write_shard
+from unghost.core.packing import dequantize_signed, unpack_labels
+from unghost.core.shards import read_shard, write_shard
 from unghost.prior.batches import (
     BLIND_SEVERITY,
     DEPTH_JITTER,

@@ -5,7 +5,8 @@ from hypothesis import strategies as st
 
 from unghost.core.channels import CHANNEL_NAMES, UNKNOWN
 from unghost.core.manifest import Manifest
-from unghost.core.shards import dequantize_signed, pack_labels, quantize_signed, read_shard, write_shard
+from unghost.core.packing import dequantize_signed, pack_labels, quantize_signed
+from unghost.core.shards import read_shard, write_shard
 from unghost.prior.batches import stored_channels
 from unghost.prior.evaluate import KeepCurve, evaluate, masked_iou
 

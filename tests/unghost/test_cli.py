@@ -3,7 +3,8 @@ import pytest
 
 from unghost import cli, commands
 from unghost.commands_prior import expand_shards
-from unghost.core.shards import pack_labels, write_shard
+from unghost.core.packing import pack_labels
+from unghost.core.shards import write_shard
 from unghost.grids import load_grid, save_grid
 
 VERBS = ("demo", "clean", "bench", "curate", "harvest", "preview", "train", "sample", "export", "verify")

@@ -5,7 +5,8 @@ import pytest
 
 from unghost import cli
 from unghost.core.channels import CHANNEL_NAMES
-from unghost.core.shards import pack_labels, write_shard
+from unghost.core.packing import pack_labels
+from unghost.core.shards import write_shard
 
 torch = pytest.importorskip("torch")
 
