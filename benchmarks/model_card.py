@@ -34,7 +34,8 @@ def sources(shards: Iterable[dict[str, Any]]) -> list[list[str]]:
     total: dict[str, list[float]] = {}
     for shard in shards:
         entry = total.setdefault(shard["source"], [0, 0, 0.0])
-        entry[0], entry[1], entry[2] = entry[0] + 1, entry[1] + shard["cubes"], entry[2] + shard["weight"]
+        entry[0] += shard.get("shards", 1)
+        entry[1], entry[2] = entry[1] + shard["cubes"], entry[2] + shard["weight"]
     whole = sum(entry[2] for entry in total.values())
     return [[name, f"{n}", f"{cubes}", f"{weight / whole:.2f}"] for name, (n, cubes, weight) in total.items()]
 

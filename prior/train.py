@@ -84,6 +84,17 @@ def _write_text(path: Path, text: str) -> None:
     os.replace(partial, path)
 
 
+def _by_folder(shards: Sequence[tuple[str | Path, float]], lengths: Sequence[int]) -> list[dict[str, Any]]:
+    """Shards of one folder as one entry: a manifest travels with every export, and a harvest has a shard a scene."""
+    groups: dict[str, dict[str, Any]] = {}
+    for (path, weight), cubes in zip(shards, lengths):
+        name, source = Path(path).name, Path(path).parent.name
+        entry = groups.setdefault(source, {"source": source, "first": name, "shards": 0, "cubes": 0, "weight": 0.0})
+        entry |= {"last": name, "shards": entry["shards"] + 1, "cubes": entry["cubes"] + cubes,
+                  "weight": entry["weight"] + weight}  # fmt: skip
+    return [entry | {"weight": round(entry["weight"], 6)} for entry in groups.values()]
+
+
 def _provenance(trainer: Trainer, shards: Sequence[tuple[str | Path, float]], blend: Blend) -> dict[str, Any]:
     config = trainer.config
     opened = [] if blend.mixture is None else blend.mixture.shards
@@ -93,10 +104,7 @@ def _provenance(trainer: Trainer, shards: Sequence[tuple[str | Path, float]], bl
         "torch": versions().get("torch", ""), "gflop": round(network_gflop(config.network), 4),
         "objective": config.objective, "learning_rate": config.learning_rate, "keep_weight": config.keep_weight,
         "threshold_from": config.threshold_from, "started_from": trainer.started_from,
-        "shards": [
-            {"source": Path(path).parent.name, "name": Path(path).name, "weight": weight, "cubes": len(shard)}
-            for (path, weight), shard in zip(shards, opened)
-        ],
+        "shards": _by_folder(shards, [len(shard) for shard in opened]),
         "drop_channels": config.drop_channels,
         "online": [{"name": part.name, "share": part.share} for part in blend.online],
     }  # fmt: skip

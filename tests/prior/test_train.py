@@ -62,7 +62,8 @@ def test_a_whole_run(tiny_config, shards, tmp_path):
     assert denoiser.manifest.parameters == sum(value.numel() for value in denoiser.network.parameters())
     training = denoiser.manifest.training
     assert (training["steps"], training["seed"], training["precision"]) == (6, 3, "fp32")
-    assert [shard["name"] for shard in training["shards"]] == ["a", "b"]
+    (source,) = training["shards"]
+    assert (source["first"], source["last"], source["shards"]) == ("a", "b", 2)
     averaged = {name: value for name, value in read_tensors(tmp_path / "run" / "state.safetensors")[0].items()}
     for name, value in denoiser.network.state_dict().items():
         assert torch.equal(value, averaged[f"average.{name}"])
