@@ -1,0 +1,112 @@
+"""Does training wait for its data? Cubes a second of the loader alone, of the network alone, and of both together.
+
+    python benchmarks/training_speed.py out/harvest out/procedural
+
+The loader reads shards, draws symmetries and optical depths, unpacks labels and stacks the channels, as in
+``unghost train``; the network learns from one batch again and again (forward, backward, AdamW, average). Each size is
+timed with the cube alone and with all channels. Writes docs/results/training_speed.json.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+from fit_cache import say
+
+from unghost.commands_prior import expand_shards
+from unghost.core.channels import CHANNEL_NAMES
+from unghost.core.results import build_results, write_results
+from unghost.prior.batches import Mixture
+from unghost.prior.config import TrainConfig
+from unghost.prior.network import SIZES
+from unghost.prior.trainer import Trainer
+
+ROOT = Path(__file__).resolve().parents[1]
+WARM_UP = 3
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to time.
+
+    Attributes:
+        shards: FOLDER or FOLDER=WEIGHT, as ``unghost train`` takes them.
+        sizes: of the network.
+        batch_size: cubes a step.
+        batches: that are timed, for the median.
+        threads: of torch.
+        out: where training_speed.json goes.
+    """
+
+    shards: tyro.conf.Positional[tuple[str, ...]]
+    sizes: tuple[str, ...] = ("xs", "s", "m")
+    batch_size: int = 48
+    batches: int = 15
+    threads: int = 2
+    out: Path = ROOT / "docs" / "results"
+
+
+def per_second(work: Callable[[], Any], options: Options) -> float:
+    """Cubes a second, from the median call."""
+    durations = []
+    for _ in range(WARM_UP + options.batches):
+        begun = time.perf_counter()
+        work()
+        durations.append(time.perf_counter() - begun)
+    return options.batch_size / statistics.median(durations[WARM_UP:])
+
+
+def loader_speed(mixture: Mixture, options: Options) -> float:
+    """Of the stream alone, as fast as it comes: over all batches, because it works ahead."""
+    with closing(mixture.stream(0, options.batch_size)) as stream:
+        for _ in range(WARM_UP):
+            next(stream)
+        begun = time.perf_counter()
+        for batch in itertools.islice(stream, options.batches):
+            if batch.channels.shape[:2] != (options.batch_size, len(mixture.channels)):
+                raise ValueError(f"loader_speed: a batch of shape {batch.channels.shape}")
+        return options.batch_size * options.batches / (time.perf_counter() - begun)
+
+
+def row_of(size: str, channels: Sequence[str], options: Options) -> dict[str, Any]:
+    """Loader, network, both together."""
+    network = dataclasses.replace(SIZES[size], channels=tuple(channels))
+    trainer = Trainer(TrainConfig(network=network, batch_size=options.batch_size))
+    shards = [pair for spec in options.shards for pair in expand_shards(spec)]
+    mixture = Mixture(shards, seed=0, channels=channels, drop_channels=trainer.config.drop_channels)
+    batch = mixture.batch(0, options.batch_size)
+    loader, alone = loader_speed(mixture, options), per_second(lambda: trainer.learn(batch), options)
+    with closing(mixture.stream(0, options.batch_size)) as stream:
+        both = per_second(lambda: trainer.learn(next(stream)), options)
+    row = {
+        "method": size, "channels": list(channels), "loader_cubes_per_second": loader,
+        "network_cubes_per_second": alone, "training_cubes_per_second": both, "loader_over_network": loader / alone,
+        "precision": "bf16" if trainer.bf16 else "fp32",
+    }  # fmt: skip
+    say(f"{size:2s} {len(channels)} channels: loader {loader:.0f}, network {alone:.0f}, together {both:.0f} cubes/s")
+    return row
+
+
+def main() -> None:
+    options = tyro.cli(Options, description=__doc__)
+    torch.set_num_threads(options.threads)
+    sets = (CHANNEL_NAMES[:1], CHANNEL_NAMES)
+    rows = [row_of(size, channels, options) for size in options.sizes for channels in sets]
+    folders = " ".join(Path(spec).name for spec in options.shards)
+    command = f"python benchmarks/training_speed.py {folders} --sizes {' '.join(options.sizes)}"
+    results = build_results(rows, command=command, seeds=[0], threads=options.threads, batch_size=options.batch_size)
+    write_results(options.out / "training_speed.json", results)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,32 @@
+"""The benchmark of the loader and the trainer runs, and says what it timed."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("torch")
+pytest.importorskip("tyro")
+
+BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
+
+
+def test_loader_network_and_both(shard_paths, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    import training_speed
+
+    monkeypatch.setattr(
+        sys, "argv",
+        ["training_speed.py", str(shard_paths["a"]), "--sizes", "xs", "--batches", "1", "--batch-size", "2",
+         "--threads", "1", "--out", str(tmp_path)],
+    )  # fmt: skip
+    training_speed.main()
+    found = json.loads((tmp_path / "training_speed.json").read_text(encoding="utf-8"))
+    assert [(row["method"], len(row["channels"])) for row in found["rows"]] == [("xs", 1), ("xs", 4)]
+    for row in found["rows"]:
+        assert row["loader_over_network"] == pytest.approx(
+            row["loader_cubes_per_second"] / row["network_cubes_per_second"]
+        )
+        assert row["training_cubes_per_second"] > 0
+    assert str(tmp_path) not in json.dumps(found)
