@@ -1,6 +1,6 @@
 """Show what a harvest is: a page with pictures, the statistics beside a real capture's, and a small sample.
 
-    python benchmarks/harvest_page.py out/harvest [--hours H]
+    python benchmarks/harvest_page.py out/harvest --seconds S --scenes N
 
 Writes docs/harvest.md and docs/harvest/pairs.png, and docs/harvest/sample: a shard of some fifty cubes of scenes
 without meshes (so that all of it is generated), for a look and for tests. Run benchmarks/harvest_statistics.py first.
@@ -21,13 +21,13 @@ from numpy.typing import NDArray
 
 from unghost.core.occupancy import FREE_LABEL, SURFACE_LABEL, opacity_from_signed
 from unghost.core.packing import dequantize_signed, unpack_labels
-from unghost.core.shards import Shard, read_shard, write_shard
+from unghost.core.shards import ARRAYS, Shard, read_shard, write_shard
 from unghost.data_recipes.harvest_config import HarvestConfig
 from unghost.data_recipes.preview import draw_pair, find_shards
 from unghost.data_recipes.render import GHOST, SURFACE, UNJUDGED
 
 ROOT = Path(__file__).resolve().parents[1]
-SAMPLE_CUBES = 60  # 77 kB each
+SAMPLE_CUBES = 60  # 82 kB each
 SHOWN, WIDTH, GAP = 6, 192, 8
 HEADINGS = ("what the field shows", "the truth", "a slice: opacity", "labels", "surroundings", "views (white: 24+)")
 MOST_VIEWS = 24
@@ -39,7 +39,7 @@ class Options:
 
     Attributes:
         harvest: folder of harvested shards.
-        seconds: that the harvest took on two cores with nothing beside it; told in the page.
+        seconds: that the harvest took: the processor time of all workers, over two; told in the page.
         scenes: that were asked for.
         docs: the folder that is written to.
     """
@@ -82,7 +82,7 @@ def write_sample(shards: list[Shard], target: Path) -> int:
     chosen = [shards[i] for i in np.unique(np.linspace(0, len(shards) - 1, 12).round().astype(int))]
     each = SAMPLE_CUBES // len(chosen)
     rows = [np.linspace(0, len(shard) - 1, each).round().astype(int) for shard in chosen]
-    names = ("inputs", "labels", "severity", "edge_fraction", "group", "surroundings", "view_count", "frames")
+    names = (*ARRAYS, "surroundings", "view_count", "transmittance", "frames")
     arrays = {name: np.concatenate([getattr(s, name)[r] for s, r in zip(chosen, rows)]) for name in names}
     if target.exists():
         shutil.rmtree(target)
@@ -160,7 +160,7 @@ def page(options: Options, found: dict[str, Any], sample_bytes: int) -> str:
     config = HarvestConfig()
     kinds = ", ".join(f"{count} {kind} at {resolution}" for (kind, resolution), count in found["kinds"].items())
     low, middle, high = found["psnr"]
-    time = f", in {options.seconds / 3600:.1f} hours on two cores" if options.seconds else ""
+    time = f", in {options.seconds / 3600:.1f} hours of two cores' processor time" if options.seconds else ""
     asked = f" of {options.scenes} (in the others a fit failed or no free path was found)" if options.scenes else ""
     return "\n".join([
         "# The harvest", "",

@@ -8,7 +8,6 @@ Each is stored with its surroundings, its frame, and how many photos saw each vo
 from __future__ import annotations
 
 import dataclasses
-import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
@@ -265,7 +264,6 @@ def harvest(
     folder, config = Path(out), config or HarvestConfig()
     if scenes < 1 or workers < 1:
         raise ValueError(f"harvest: scenes and workers must be >= 1, got {scenes} and {workers}")
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
     started = time.perf_counter()
     root = None if mesh_root is None else str(mesh_root)
     with locked(folder, verb="harvest"):

@@ -4,12 +4,14 @@ import dataclasses
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from unghost import cli
 from unghost.core.channels import CHANNEL_NAMES
 from unghost.core.manifest import FORMAT, METADATA_KEY, Manifest
-from unghost.core.shards import ARRAYS
+from unghost.core.packing import unpack_labels
+from unghost.core.shards import ARRAYS, read_shard
 from unghost.core.shards import FORMAT as SHARD_FORMAT
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -36,3 +38,15 @@ def test_every_verb_is_in_the_readme(capsys):
     verbs = re.search(r"\{([a-z,]+)\}", capsys.readouterr().out).group(1).split(",")
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     assert [verb for verb in verbs if f"`unghost {verb}" not in readme] == []
+
+
+def test_the_sample_of_the_harvest_is_whole_small_and_ours():
+    folder = ROOT / "docs" / "harvest" / "sample"
+    shard = read_shard(folder, verify=True)
+    assert len(shard) == 60
+    assert len(set(shard.group.tolist())) > 10
+    assert shard.provenance["licence"] == "generated"
+    for name in ("surroundings", "view_count", "transmittance", "frames"):
+        assert getattr(shard, name) is not None, name
+    assert set(np.unique(unpack_labels(shard.labels))) == {0, 1, 2}
+    assert sum(path.stat().st_size for path in folder.iterdir()) < 5e6
