@@ -27,16 +27,23 @@ def versions() -> dict[str, str]:
 
 
 def commit() -> str:
-    """The checkout's commit, ``-dirty`` appended if tracked files differ; ``unknown`` outside a checkout."""
-    folder = Path(__file__).resolve().parent
+    """The checkout's commit, ``-dirty`` appended if tracked files differ; ``unknown`` outside a checkout.
+
+    What lies under ``docs`` does not count: it is written by the programs whose results are recorded.
+    """
+    folder = Path(__file__).resolve().parents[1]
+
+    def git(*words: str) -> str:
+        return subprocess.run(
+            ["git", *words], cwd=folder, capture_output=True, text=True, timeout=10, check=True
+        ).stdout.strip()
+
     try:
-        text = subprocess.run(
-            ["git", "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"],
-            cwd=folder, capture_output=True, text=True, timeout=10, check=True,
-        ).stdout.strip()  # fmt: skip
+        name = git("rev-parse", "--short=12", "HEAD")
+        changed = git("status", "--porcelain", "--untracked-files=no", "--", ".", ":!docs")
     except (OSError, subprocess.SubprocessError):
         return "unknown"
-    return text or "unknown"
+    return f"{name}-dirty" if changed else name
 
 
 def machine() -> dict[str, Any]:

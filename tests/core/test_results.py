@@ -1,5 +1,7 @@
 import json
 import os
+import re
+import subprocess
 
 import pytest
 
@@ -51,3 +53,23 @@ def test_an_interrupted_write_leaves_the_old_file(tmp_path, monkeypatch):
 def test_commit_is_unknown_without_git(monkeypatch):
     monkeypatch.setenv("PATH", "")
     assert results.commit() == "unknown"
+
+
+def test_results_do_not_make_the_checkout_dirty_but_code_does(tmp_path, monkeypatch):
+    def git(*words):
+        subprocess.run(["git", "-c", "user.name=a", "-c", "user.email=a@b", *words], cwd=tmp_path, check=True)
+
+    for name in ("core/results.py", "docs/results/a.json"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("1")
+    git("init", "-q")
+    git("add", "-A")
+    git("commit", "-qm", "first")
+    monkeypatch.setattr(results, "__file__", str(tmp_path / "core" / "results.py"))
+    clean = results.commit()
+    assert re.fullmatch("[0-9a-f]{12}", clean)
+    (tmp_path / "docs" / "results" / "a.json").write_text("2")
+    (tmp_path / "new.txt").touch()
+    assert results.commit() == clean
+    (tmp_path / "core" / "results.py").write_text("2")
+    assert results.commit() == f"{clean}-dirty"
