@@ -138,7 +138,7 @@ def trained(variant: str, options: Options, shards: Sequence[tuple[str, float]])
             seed=options.seed, threads=options.threads, validate_seconds=0.0,
         )  # fmt: skip
         used = bit_shards(shards, options.runs / "bits") if variant == BIT else shards
-        train(config, train_shards=used, out=folder, resume=folder.exists())
+        train(config, train_shards=used, out=folder, resume=True)
     return model
 
 

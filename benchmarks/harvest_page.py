@@ -39,7 +39,8 @@ class Options:
 
     Attributes:
         harvest: folder of harvested shards.
-        seconds: that the harvest took: the processor time of all workers, over two; told in the page.
+        seconds: that the harvest took: the processor time of all workers over two, scaled up where only some
+            scenes were timed; told in the page.
         scenes: that were asked for.
         docs: the folder that is written to.
     """
@@ -160,7 +161,7 @@ def page(options: Options, found: dict[str, Any], sample_bytes: int) -> str:
     config = HarvestConfig()
     kinds = ", ".join(f"{count} {kind} at {resolution}" for (kind, resolution), count in found["kinds"].items())
     low, middle, high = found["psnr"]
-    time = f", in {options.seconds / 3600:.1f} hours of two cores' processor time" if options.seconds else ""
+    time = f", in about {options.seconds / 3600:.1f} hours of two cores' processor time" if options.seconds else ""
     asked = f" of {options.scenes} (in the others a fit failed or no free path was found)" if options.scenes else ""
     return "\n".join([
         "# The harvest", "",

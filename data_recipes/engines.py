@@ -108,8 +108,8 @@ class LocalEngine:
 
     def _submit(self, call: Callable[..., Result], task: Task) -> Future[Result]:
         if self._pool is None:
-            os.environ.setdefault("OMP_NUM_THREADS", "1")  # for workers: linear algebra in threads of its own, in
-            self._pool = ProcessPoolExecutor(  # several processes at once, takes three times as long
+            os.environ.setdefault("OMP_NUM_THREADS", "1")  # linear algebra in threads would fight over the cores
+            self._pool = ProcessPoolExecutor(
                 self.workers, mp_context=multiprocessing.get_context("spawn"), initializer=_end_with_parent
             )
         return self._pool.submit(call, *task)

@@ -16,6 +16,7 @@ def test_loader_network_and_both(shard_paths, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     import training_speed
 
+    monkeypatch.setattr(training_speed.torch, "set_num_threads", lambda count: None)  # other tests keep theirs
     monkeypatch.setattr(
         sys, "argv",
         ["training_speed.py", str(shard_paths["a"]), "--sizes", "xs", "--batches", "1", "--batch-size", "2",
