@@ -20,7 +20,7 @@ import numpy as np
 import tyro
 from denoise import Options as Measurement
 from denoise import all_sets, mean_over_severities, row_of
-from denoise_sets import MIXED, CubeSet
+from denoise_sets import MIXED, CubeSet, blind
 from fit_cache import say
 
 from unghost import load_denoiser
@@ -120,11 +120,6 @@ def _untouched(shard: Shard) -> dict[str, Any]:
 def seen(cubes: CubeSet, variant: str) -> CubeSet:
     """The set as a variant is shown it; scores are of the original one."""
     return dataclasses.replace(cubes, signed=as_bits(cubes.signed)) if variant == BIT else cubes
-
-
-def blind(cubes: CubeSet) -> CubeSet:
-    """The set with every optional channel unknown."""
-    return dataclasses.replace(cubes, surroundings=None, view_count=None, transmittance=None)
 
 
 def trained(variant: str, options: Options, shards: Sequence[tuple[str, float]]) -> Path:

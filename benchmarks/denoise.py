@@ -7,7 +7,8 @@ corruption at five severities, and ``mixed`` as recipes have it), ``synthetic-so
 scenes that were not trained on), ``harvest-unseen-field`` (of a kind not trained on) and ``capture`` (a real
 capture's field against its pseudo ground truth, ``capture_cubes.py``). Methods: the input as it is, classical filters
 (``classical.py``), every model named. Each model is scored at its default timestep; on ``mixed`` also at the best of
-a few. Scores: ``denoise_scores.py``. Writes ``denoise.json`` and ``denoise.png``; finished rows are kept at once.
+a few; one that takes optional channels also without them (``NAME, blind``). Scores: ``denoise_scores.py``. Writes
+``denoise.json`` and ``denoise.png``; finished rows are kept at once.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import tyro
 from classical import Classical
 from denoise_figure import draw
 from denoise_scores import score
-from denoise_sets import MIXED, SEED, SEVERITIES, CubeSet, capture_set, harvest_set, mesh_sets
+from denoise_sets import MIXED, SEED, SEVERITIES, CubeSet, blind, capture_set, harvest_set, mesh_sets, tells_more
 from denoise_speed import UNTRAINED, Model, speed_row, untrained_rows
 from fit_cache import file_hash, say
 from numpy.typing import NDArray
@@ -172,14 +173,19 @@ def measure(options: Options) -> dict[str, Any]:
     priors = {name: file_hash(file) if "." in file else load_denoiser(file).manifest.body_sha256
               for name, file in files.items()}  # fmt: skip
     for name, denoiser in methods:
+        about = {"model": name} if name in files else {}
         for variant, used, timestep in variants_of(name, denoiser, options.timesteps):
-            for cubes in sets:
-                row = row_of(variant, used, cubes, timestep)
-                if name in files and cubes.about.get("family") == MIXED:
-                    row = with_best_timestep(row, variant, used, cubes)
-                rows.append(row)
-            rows.append(mean_over_severities(rows, variant))
+            mine = [row_of(variant, used, cubes, timestep) | about for cubes in sets]
+            if about:
+                mine = [
+                    with_best_timestep(row, variant, used, cubes) if cubes.about.get("family") == MIXED else row
+                    for row, cubes in zip(mine, sets)
+                ]
+            rows += [*mine, mean_over_severities(mine, variant) | about]
             say(_headline(rows, variant))
+        if len(denoiser.manifest.channels) > 1:
+            rows += [row_of(f"{name}, blind", denoiser, blind(cubes), denoiser.manifest.default_timestep) | about
+                     for cubes in sets if tells_more(cubes)]  # fmt: skip
         if name in files:
             rows.append(speed_row(Model.of(name, files[name], WEIGHTS), options.threads))
         results = build_results(

@@ -32,26 +32,34 @@ def _value(rows: Sequence[dict[str, Any]], method: str, name: str, key: str) -> 
 
 
 def draw(path: Path, rows: Sequence[dict[str, Any]]) -> None:
-    """A panel a set: models against their speed, filters (untimed) as lines."""
+    """A panel a set: models against their speed, the best way to use each filled and named, the best of the filters
+    (untimed) and the input as lines."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
     speeds = {row["method"]: row["cubes_per_second"] for row in rows if "cubes_per_second" in row}
+    models = {row["method"]: row.get("model") for row in rows}
     names = list(dict.fromkeys(row["method"] for row in rows))
     figure, axes = plt.subplots(1, len(PANELS), figsize=(17, 5.2), constrained_layout=True)
     for axis, (name, key, heading) in zip(axes, PANELS):
         found = {method: _value(rows, method, name, key) for method in names}
-        timed = [(method, speeds[method.partition("@")[0]], value) for method, value in found.items()
-                 if value is not None and method.partition("@")[0] in speeds]  # fmt: skip
+        timed = [(method, speeds[models[method]], value) for method, value in found.items()
+                 if value is not None and models[method] in speeds]  # fmt: skip
+        best: dict[Any, tuple[float, str]] = {}  # of the ways to use a model
+        for method, _, value in timed:
+            best[models[method]] = max(best.get(models[method], (value, method)), (value, method))
         for method, speed, value in timed:
-            axis.plot(speed, value, "o", color="#2a7f62")
+            named = best[models[method]][1] == method
+            axis.plot(speed, value, "o", color="#2a7f62", fillstyle="full" if named else "none")
+            if not named:
+                continue
             axis.annotate(method, (speed, value), xytext=(5, 4), textcoords="offset points", fontsize=8)
         front = [timed[index] for index in pareto([(speed, value) for _, speed, value in timed])]
         axis.plot([speed for _, speed, _ in front], [value for _, _, value in front], color="#2a7f62", linewidth=1)
-        filters = {m: v for m, v in found.items() if v is not None and m.partition("@")[0] not in speeds}
-        for method in [*sorted(filters, key=lambda m: -(filters[m] or 0.0))[:2], "input"]:
+        filters = {m: v for m, v in found.items() if v is not None and models[m] is None}
+        for method in [*sorted(filters, key=lambda m: -(filters[m] or 0.0))[:1], "input"]:
             if method in filters:
                 axis.axhline(filters[method], color="#999999", linewidth=0.8, linestyle="--")
                 axis.annotate(f"{method} (no training)", (0.01, filters[method]), fontsize=7, color="#666666",

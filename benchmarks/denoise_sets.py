@@ -66,6 +66,16 @@ class CubeSet:
         return dataclasses.replace(self, **arrays)
 
 
+def blind(cubes: CubeSet) -> CubeSet:
+    """The set with every optional channel unknown."""
+    return dataclasses.replace(cubes, surroundings=None, view_count=None, transmittance=None)
+
+
+def tells_more(cubes: CubeSet) -> bool:
+    """Whether the set knows more of its cubes than their opacity."""
+    return any(value is not None for value in (cubes.surroundings, cubes.view_count, cubes.transmittance))
+
+
 def from_shards(name: str, shards: list[Shard], count: int, **about: Any) -> CubeSet:
     """Some ``count`` cubes with any surface, as many from each shard."""
     parts = []

@@ -35,7 +35,7 @@ def demo(results: dict[str, Any]) -> list[str]:
     keys = ("floater_recall", "floater_precision", "surface_kept", "iou_before", "iou")
     rows = [[row["method"], *(number(row[key]) for key in keys), number(row["seconds"], 1)] for row in results["rows"]]
     head = ("method", "ghosts removed", "of what was removed, ghosts", "surface kept", "IoU before", "after", "seconds")
-    said = "The prior's removal threshold was chosen on other rooms of this kind (`benchmarks/threshold.py`)."
+    said = "The prior's removal threshold was chosen on other rooms of this kind (`benchmarks/ship.py`)."
     return ["**The demo's room** (`make demo`; every ghost labelled):", "", *table(head, rows), "", said]
 
 
@@ -65,31 +65,47 @@ def denoise(results: dict[str, Any]) -> list[str]:
     ]  # fmt: skip
     foggy = [name for name in FOG if ("input", name, None, None) in found]
     if foggy:
-        lines = [[method, *(_removed(found[method, name, None, None]) for name in foggy)] for method in methods]
+        lines = [
+            [method, *(_removed(found[method, name, None, None]) for name in foggy)]
+            for method in dict.fromkeys(row["method"] for row in rows if row["set"] == foggy[0])
+        ]
         text += [
             "**Cubes of badly constrained fields**: ghost voxels removed while .98 / .90 of the true ones stay, one "
             "threshold for all cubes of a set:", "",
             *table(["method", *(FOG[name] for name in foggy)], lines), "",
-            *(f"{line}\n" for line in (_beaten(found, name, speeds) for name in foggy) if line),
+            *(f"{line}\n" for line in (_beaten(found, name) for name in foggy) if line),
         ]  # fmt: skip
     speed = next(iter(speeds.values()))
     bare = [f"{name} {row['cubes_per_second']:.1f}" for name, row in speeds.items() if not row.get("trained", True)]
     said = f" Not trained, so nothing but their speed can be told: {', '.join(bare)} cubes/s." if bare else ""
     return [
         *text,
-        f"Speed through onnxruntime (batch {speed['batch']}, {speed['threads']} threads).{said}", "",
+        *table(MODEL_HEAD, (_model(row) for row in speeds.values() if row.get("trained", True))), "",
+        f"Speed with batches of {speed['batch']} and {speed['threads']} threads.{said}", "",
         "![speed against error](docs/results/denoise.png)",
     ]  # fmt: skip
 
 
-def _beaten(found: dict[Any, Row], name: str, learned: dict[str, Row]) -> str:
+MODEL_HEAD = ("model", "sees", "parameters", "GFLOP a cube", "MB", "stored in", "cubes/s, onnxruntime", "torch")
+
+
+def _model(row: Row) -> list[str]:
+    """How large a model is, and how fast."""
+    speeds = [f"{row[key]:.0f}" if key in row else "–" for key in ("cubes_per_second", "torch_cubes_per_second")]
+    seen = ", ".join(name.removeprefix("signed_").replace("_count", "s") for name in row["channels"])
+    return [row["method"], seen, str(row["parameters"]), number(row["gflop"], 2), number(row["megabytes"], 2),
+            row["precision"], *speeds]  # fmt: skip
+
+
+def _beaten(found: dict[Any, Row], name: str) -> str:
     """A sentence if no learned prior is the best on a set of fog."""
-    scores = {key[0]: row["ghosts_removed_98"] for key, row in found.items() if key[1] == name}
+    scores = {key[0]: (row["ghosts_removed_98"], "model" in row or key[0] == "unghost") for key, row in found.items() if key[1] == name}
     best = max(scores, key=lambda method: scores[method])
-    mine = max((method for method in scores if method in learned), key=lambda method: scores[method])
-    if best in learned:
+    if scores[best][1]:
         return ""
-    return f"On {FOG[name]} {mine} **loses** to {best} at .98 kept ({scores[mine]:.3f} against {scores[best]:.3f})."
+    mine = max((method for method in scores if scores[method][1]), key=lambda method: scores[method])
+    losing, winning = scores[mine][0], scores[best][0]
+    return f"On {FOG[name]} {mine} **loses** to {best} at .98 kept ({losing:.3f} against {winning:.3f})."
 
 
 def _removed(row: Row) -> str:

@@ -119,15 +119,20 @@ class TorchDenoiser:
         return x0_pred
 
 
-def save_model(path: str | Path, network: AnyNetwork, manifest: Manifest) -> None:
-    """Write weights, manifest and network configuration as one safetensors file, atomically."""
+def save_model(path: str | Path, network: AnyNetwork, manifest: Manifest, *, half: bool = False) -> None:
+    """Write weights, manifest and network configuration as one safetensors file, atomically.
+
+    With ``half`` the weights are stored as float16, rounded to it: half the file. :func:`load_model` computes in
+    float32 with either.
+    """
     if manifest.channels != network.config.channels:
         raise ValueError(
             f"save_model: the manifest names the channels {manifest.channels}, "
             f"the network takes {network.config.channels}"
         )
     metadata = {METADATA_KEY: manifest.to_json(), CONFIG_KEY: json.dumps(network.config.to_dict(), sort_keys=True)}
-    write_tensors(path, network.state_dict(), metadata)
+    stored = {name: value.half() if half else value for name, value in network.state_dict().items()}
+    write_tensors(path, stored, metadata)
 
 
 def network_from_tensors(tensors: Mapping[str, Tensor], metadata: Mapping[str, str], *, origin: str) -> AnyNetwork:

@@ -129,6 +129,52 @@ def test_the_front_is_what_nothing_beats_in_both(parts):
     assert parts["figure"].pareto([]) == []
 
 
+def test_blind_is_the_same_cubes_and_nothing_about_them(parts):
+    cubes = parts["sets"].CubeSet(
+        "harvest", {}, signed(plate())[None], np.zeros((1, 32, 32, 32), np.uint8), np.full(1, 0.1, np.float32),
+        np.zeros(1, np.int32), view_count=np.ones((1, 32, 32, 32), np.uint8),
+    )  # fmt: skip
+    blind = parts["sets"].blind(cubes)
+    assert parts["sets"].tells_more(cubes)
+    assert not parts["sets"].tells_more(blind)
+    assert blind.signed is cubes.signed
+
+
+def test_the_figure_times_a_way_to_use_a_model_by_its_model(parts, tmp_path):
+    """Every way to use a model is drawn at the model's speed, the best one named; what has no model is a line."""
+    from matplotlib.figure import Figure
+
+    rows = [{"method": "m", "set": "speed", "cubes_per_second": 100.0, "trained": True}]
+    rows += [
+        {"method": method, "set": "harvest", "ghosts_removed_98": value, **about}
+        for method, value, about in (
+            ("input", 0.0, {}), ("median", 0.1, {}), ("m", 0.3, {"model": "m"}), ("m, blind", 0.2, {"model": "m"}),
+            ("m+noise@50", 0.1, {"model": "m"}),
+        )
+    ]  # fmt: skip
+    drawn = {}
+
+    class Spy(Figure):
+        def savefig(self, *args, **kwargs):
+            for axis in self.axes:
+                drawn.setdefault("points", []).extend(
+                    [tuple(line.get_xydata()[0]) for line in axis.lines if line.get_marker() == "o"]
+                )
+                drawn.setdefault("texts", []).extend(text.get_text() for text in axis.texts)
+            super().savefig(*args, **kwargs)
+
+    from matplotlib import pyplot as plt
+
+    original = plt.figure
+    plt.figure = lambda *args, **kwargs: original(*args, FigureClass=Spy, **kwargs)
+    try:
+        parts["figure"].draw(tmp_path / "figure.png", rows)
+    finally:
+        plt.figure = original
+    assert sorted(drawn["points"]) == [(100.0, 0.1), (100.0, 0.2), (100.0, 0.3)]
+    assert set(drawn["texts"]) == {"m", "median (no training)", "input (no training)"}
+
+
 def test_damage_repeats_and_grows(parts):
     clean = parts["sets"].CubeSet(
         "clean", {}, signed(plate())[None], np.where(plate(), SURFACE_LABEL, FREE_LABEL).astype(np.uint8)[None],

@@ -112,3 +112,21 @@ def test_nothing_is_left_behind_and_same_weights_give_same_bytes(saved, tmp_path
     save_model(path, network, Manifest(name="tiny", default_timestep=700))
     assert path.read_bytes() == first
     assert [item.name for item in tmp_path.iterdir()] == ["model.safetensors"]
+
+
+def test_half_precision_is_half_the_file_and_the_same_model_rounded(tmp_path):
+    torch.manual_seed(0)
+    network = RestorationNet(TINY)
+    manifest = Manifest(name="tiny", default_timestep=700)
+    for name, half in (("full", False), ("half", True)):
+        save_model(tmp_path / f"{name}.safetensors", network, manifest, half=half)
+    sizes = [(tmp_path / f"{name}.safetensors").stat().st_size for name in ("full", "half")]
+    assert sizes[1] < 0.75 * sizes[0]  # the header stays
+    loaded = load_model(tmp_path / "half.safetensors")
+    for key, value in network.state_dict().items():
+        found = loaded.network.state_dict()[key]
+        assert found.dtype == torch.float32
+        torch.testing.assert_close(found, value.half().float(), rtol=0.0, atol=0.0)
+    cubes = torch.rand(2, 1, 32, 32, 32) * 2 - 1
+    exact = TorchDenoiser(network, manifest)(cubes, 700, 0.1)
+    assert 0 < (loaded(cubes, 700, 0.1) - exact).abs().max() < 1e-2

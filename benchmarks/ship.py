@@ -1,0 +1,134 @@
+"""Make a trained model one of the shipped ones: choose its removal threshold, store and export it.
+
+    python benchmarks/ship.py out/run/model.safetensors default
+    python benchmarks/ship.py out/other/model.safetensors m --half
+
+`clean` is run on demo rooms that are used for nothing else (the demo shows room 0), at every candidate. The
+largest one that keeps the wanted share of the surface, mean over the rooms, goes into the manifest. How the
+thresholds of single cubes differ from it: `clean` has the last word on pieces, pores and skirts of surfaces. No
+cameras are told, so a model that takes view counts does without them here.
+
+Writes NAME.safetensors and NAME.onnx among the weights, and the candidates' scores into ``threshold.json``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+
+from unghost import load_denoiser
+from unghost.core.results import build_results, write_results
+from unghost.demo import score
+from unghost.demo_room import AABB, SHAPE, build_room
+from unghost.denoisers import WEIGHTS
+from unghost.export.quantize import export_precisions
+from unghost.grids import cell_centers, grid_density_fn
+from unghost.prior.checkpoint import load_model, save_model
+from unghost.regularizer.clean import clean
+
+ROOT = Path(__file__).resolve().parents[1]
+CANDIDATES = tuple(tenth / 10 for tenth in range(-6, 10))
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to ship, and what to choose from.
+
+    Attributes:
+        checkpoint: a model.safetensors of ``unghost train``.
+        name: of the shipped model: NAME.safetensors, NAME.onnx.
+        half: store the weights in half precision; the model computes in float32 all the same.
+        rooms: seeds of the rooms.
+        kept: share of the surface that must stay.
+        out: where threshold.json goes.
+        weights: where the shipped models are.
+    """
+
+    checkpoint: tyro.conf.Positional[Path]
+    name: tyro.conf.Positional[str]
+    half: bool = False
+    rooms: tuple[int, ...] = (10, 11, 12, 13)
+    kept: float = 0.985
+    out: Path = ROOT / "docs" / "results"
+    weights: Path = WEIGHTS
+
+
+class _Advising:
+    """A denoiser with another threshold in its manifest."""
+
+    def __init__(self, denoiser: Any, threshold: float) -> None:
+        self.kind, self._denoiser = denoiser.kind, denoiser
+        self.manifest = dataclasses.replace(denoiser.manifest, removal_threshold=threshold)
+
+    def __call__(self, channels: Any, timestep: Any, edge_fraction: Any) -> Any:
+        """See ``core.manifest.Denoiser``."""
+        return self._denoiser(channels, timestep, edge_fraction)
+
+
+def row_of(name: str, denoiser: Any, threshold: float, rooms: tuple[int, ...]) -> dict[str, Any]:
+    """Mean scores of ``clean`` at ``threshold``."""
+    advised = _Advising(denoiser, threshold)
+    found = []
+    for seed in rooms:
+        room = build_room(seed)
+        mask = clean(grid_density_fn(room.density, AABB), AABB, denoiser=advised, field_pitch=room.pitch)
+        found.append(score(room, np.asarray(mask.keep(cell_centers(AABB, SHAPE)))))
+    keys = ("floater_recall", "floater_precision", "surface_kept", "iou_before", "iou")
+    means = {key: float(np.mean([scores[key] for scores in found])) for key in keys}
+    return {"method": f"clean, {name}", "model": name, "threshold": threshold, **means}
+
+
+def choose(name: str, denoiser: Any, options: Options) -> tuple[float, list[dict[str, Any]]]:
+    """The threshold, and a row for each candidate up to the first that keeps too little."""
+    rows: list[dict[str, Any]] = []
+    for threshold in CANDIDATES:
+        rows.append(row_of(name, denoiser, threshold, options.rooms))
+        print(" ".join(f"{k}={v:.3f}" if isinstance(v, float) else v for k, v in rows[-1].items()), flush=True)
+        if rows[-1]["surface_kept"] < options.kept:
+            break
+    good = [row["threshold"] for row in rows if row["surface_kept"] >= options.kept]
+    if not good:
+        raise SystemExit(f"no candidate keeps {options.kept} of the surface; nothing is written")
+    return max(good), rows
+
+
+def written(options: Options, folder: Path, threshold: float) -> dict[str, Path]:
+    """The two files of the model in ``folder``."""
+    model = load_model(options.checkpoint)
+    manifest = dataclasses.replace(model.manifest, removal_threshold=threshold)
+    checkpoint = folder / f"{options.name}.safetensors"
+    save_model(checkpoint, model.network, manifest, half=options.half)
+    precision = "fp16" if options.half else "fp32"
+    exported = export_precisions(checkpoint, folder, precisions=(precision,))[precision]
+    return {".safetensors": checkpoint, ".onnx": exported}
+
+
+def record(path: Path, options: Options, rows: list[dict[str, Any]]) -> None:
+    """The rows into threshold.json, in the place of those of an earlier model of that name."""
+    kept = json.loads(path.read_text(encoding="utf-8"))["rows"] if path.is_file() else []
+    kept = [row for row in kept if row.get("model", options.name) != options.name]
+    half = " --half" if options.half else ""
+    command = f"python benchmarks/ship.py {options.checkpoint.name} {options.name}{half} --kept {options.kept:g}"
+    write_results(path, build_results([*kept, *rows], command=command, seeds=options.rooms))
+
+
+def main() -> None:
+    options = tyro.cli(Options, description=__doc__)
+    with tempfile.TemporaryDirectory() as scratch:
+        threshold, rows = choose(options.name, load_denoiser(written(options, Path(scratch), 0.0)[".onnx"]), options)
+        for suffix, path in written(options, Path(scratch), threshold).items():
+            (options.weights / f"{options.name}{suffix}").write_bytes(path.read_bytes())
+    rows = [row | {"chosen": row["threshold"] == threshold} for row in rows]
+    record(options.out / "threshold.json", options, rows)
+    print(f"{options.name}: threshold {threshold:g}")
+
+
+if __name__ == "__main__":
+    main()
