@@ -99,7 +99,11 @@ def _model(row: Row) -> list[str]:
 
 def _beaten(found: dict[Any, Row], name: str) -> str:
     """A sentence if no learned prior is the best on a set of fog."""
-    scores = {key[0]: (row["ghosts_removed_98"], "model" in row or key[0] == "unghost") for key, row in found.items() if key[1] == name}
+    scores = {
+        key[0]: (row["ghosts_removed_98"], "model" in row or key[0] == "unghost")
+        for key, row in found.items()
+        if key[1] == name
+    }
     best = max(scores, key=lambda method: scores[method])
     if scores[best][1]:
         return ""

@@ -4,7 +4,8 @@
 
 The loader reads shards, draws symmetries and optical depths, unpacks labels and stacks the channels, as in
 ``unghost train``; the network learns from one batch again and again (forward, backward, AdamW, average). Each size is
-timed with the cube alone and with all channels. Writes docs/results/training_speed.json.
+timed with the cube alone and with all channels, the first of them also before freed memory is kept
+(``prior/allocator.py``, as ``unghost train`` does). Writes docs/results/training_speed.json.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from fit_cache import say
 from unghost.commands_prior import expand_shards
 from unghost.core.channels import CHANNEL_NAMES
 from unghost.core.results import build_results, write_results
+from unghost.prior.allocator import keep_freed_memory
 from unghost.prior.batches import Mixture
 from unghost.prior.config import TrainConfig
 from unghost.prior.network import SIZES
@@ -101,7 +103,9 @@ def main() -> None:
     options = tyro.cli(Options, description=__doc__)
     torch.set_num_threads(options.threads)
     sets = (CHANNEL_NAMES[:1], CHANNEL_NAMES)
-    rows = [row_of(size, channels, options) for size in options.sizes for channels in sets]
+    rows = [row_of(size, sets[0], options) | {"memory": "returned"} for size in options.sizes]
+    memory = "kept" if keep_freed_memory() else "returned"
+    rows += [row_of(size, channels, options) | {"memory": memory} for size in options.sizes for channels in sets]
     folders = " ".join(Path(spec).name for spec in options.shards)
     command = f"python benchmarks/training_speed.py {folders} --sizes {' '.join(options.sizes)}"
     results = build_results(rows, command=command, seeds=[0], threads=options.threads, batch_size=options.batch_size)

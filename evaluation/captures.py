@@ -117,13 +117,7 @@ def load_capture(folder: str | Path, *, downscale: float = 8, normalize: bool = 
     if not downscale >= 1:
         raise ValueError(f"load_capture: downscale must be >= 1, got {downscale}")
     meta = _read_json(source / "transforms.json")
-    frames = meta.get("frames")
-    if not isinstance(frames, list) or not frames:
-        raise ValueError(f"load_capture: {source / 'transforms.json'} has no frames")
-    names = tuple(_frame_name(frame, number) for number, frame in enumerate(frames))
-    if len(set(names)) != len(names):
-        raise ValueError(f"load_capture: {_first_twice(names)!r} stands in two frames of transforms.json")
-    poses = np.stack([_pose(frame, name) for frame, name in zip(frames, names)])
+    frames, names, poses = _posed(meta, source / "transforms.json")
     paths = tuple(_photo_path(source, name) for name in names)
     sizes = [_check_photo(path, {**meta, **frame}, name) for path, frame, name in zip(paths, frames, names)]
     if len(set(sizes)) != 1:
@@ -139,6 +133,41 @@ def load_capture(folder: str | Path, *, downscale: float = 8, normalize: bool = 
         poses, np.stack([lens for lens, _ in lenses]), width, height, np.stack([bend for _, bend in lenses])
     ).resized(1.0 / downscale)
     return Capture(source, names, cameras, splits, transform, scale_factor, paths)
+
+
+def load_cameras(path: str | Path) -> Cameras:
+    """The cameras of a ``transforms.json`` alone, in its own world: no photo need be there, no Pillow.
+
+    Args:
+        path: the file, or a folder that holds one. It must state ``w`` and ``h`` (for all frames alike).
+
+    Raises:
+        ValueError: what is wrong with the file.
+    """
+    file = Path(path) / "transforms.json" if Path(path).is_dir() else Path(path)
+    meta = _read_json(file)
+    frames, names, poses = _posed(meta, file)
+    merged = [{**meta, **frame} for frame in frames]
+    sizes = [(body.get("w"), body.get("h")) for body in merged]
+    if len(set(sizes)) > 1 or not all(isinstance(side, (int, float)) and side >= 1 for side in sizes[0]):
+        raise ValueError(
+            f"load_cameras: {file} must state one w and h in pixels for all frames, got {sorted(set(sizes), key=str)}"
+        )
+    width, height = (int(side) for side in sizes[0] if side)
+    lenses = [_lens(body, name, width, height) for body, name in zip(merged, names)]
+    lens, bend = (np.stack(values) for values in zip(*lenses))
+    return Cameras.create(poses, lens, width, height, bend)
+
+
+def _posed(meta: Mapping[str, Any], path: Path) -> tuple[list[Any], tuple[str, ...], NDArray[np.float64]]:
+    """The frames, their names and poses ``(N, 3, 4)``."""
+    frames = meta.get("frames")
+    if not isinstance(frames, list) or not frames:
+        raise ValueError(f"load_capture: {path} has no frames")
+    names = tuple(_frame_name(frame, number) for number, frame in enumerate(frames))
+    if len(set(names)) != len(names):
+        raise ValueError(f"load_capture: {_first_twice(names)!r} stands in two frames of {path.name}")
+    return frames, names, np.stack([_pose(frame, name) for frame, name in zip(frames, names)])
 
 
 def _read_json(path: Path) -> dict[str, Any]:

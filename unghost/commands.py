@@ -28,6 +28,7 @@ def clean(
     grid: Positional[Path],
     out: Path | None = None,
     keep: Path | None = None,
+    cameras: Path | None = None,
     denoiser: str = "default",
     strength: float = 0.5,
     threads: Threads = 0,
@@ -38,18 +39,22 @@ def clean(
         grid: the file to clean; it is not changed.
         out: the cleaned grid; GRID-clean.npz beside it if not given.
         keep: the mask of what was kept, which undoes or repeats the cleaning; GRID-keep.npz if not given.
+        cameras: a transforms.json (nerfstudio's format) of the training photos, in the grid's own world; where few
+            or none of them look, ghosts are likelier. The photos themselves are not needed.
         denoiser: a shipped name or an .onnx file.
         strength: 0 removes nothing, 0.5 what the denoiser advises, 1 everything.
         threads: of onnxruntime; 0 leaves the choice to it.
     """
     from .cleaning import clean as clean_field
     from .denoisers import load_denoiser
+    from .evaluation.captures import load_cameras
     from .grids import cell_pitch, grid_density_fn, load_grid, save_grid
 
     density, aabb = load_grid(grid)
     mask = clean_field(
         grid_density_fn(density, aabb), aabb, denoiser=load_denoiser(denoiser, backend="onnx", threads=threads or None),
-        field_pitch=cell_pitch(aabb, density.shape, caller="clean"), strength=strength,
+        cameras=None if cameras is None else load_cameras(cameras), strength=strength,
+        field_pitch=cell_pitch(aabb, density.shape, caller="clean"),
     )  # fmt: skip
     out = out or grid.with_name(f"{grid.stem}-clean.npz")
     keep = keep or grid.with_name(f"{grid.stem}-keep.npz")

@@ -125,10 +125,12 @@ def train(
         mesh_root: folder with the meshes and their manifest.csv, for recipes that read meshes.
         resume: go on where a killed run stopped.
     """
+    from .prior.allocator import keep_freed_memory
     from .prior.config import TrainConfig
     from .prior.network import SIZES, NetworkConfig
     from .prior.train import train as run
 
+    keep_freed_memory()
     given: dict[str, Any] = {
         "name": name, "steps": steps, "max_seconds": max_seconds, "batch_size": batch_size, "seed": seed,
         "learning_rate": learning_rate, "precision": precision, "device": device, "threads": threads,

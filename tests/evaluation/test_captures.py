@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from unghost.evaluation.captures import load_capture
+from unghost.evaluation.captures import load_cameras, load_capture
 
 SHARED = Path(__file__).parents[2].parent / "shared" / "data" / "captures" / "snowmiku_plush"
 POSES = [
@@ -51,6 +51,39 @@ def test_a_capture_has_the_poses_lens_and_splits_of_its_files(tmp_path):
     np.testing.assert_array_equal(capture.split("first"), [0, 1])
     np.testing.assert_array_equal(capture.split("all"), [0, 1, 2])
     np.testing.assert_array_equal(capture.transform, np.eye(4))
+
+
+def test_cameras_need_no_photos_and_are_those_of_the_capture(tmp_path):
+    folder = _write(tmp_path / "c")
+    wanted = load_capture(folder, downscale=1, normalize=False).cameras
+    shutil.rmtree(folder / "images")
+    for path in (folder, folder / "transforms.json"):
+        found = load_cameras(path)
+        assert (found.width, found.height) == (16, 12)
+        np.testing.assert_array_equal(found.camera_to_world, wanted.camera_to_world)
+        np.testing.assert_array_equal(found.intrinsics, wanted.intrinsics)
+        np.testing.assert_array_equal(found.distortion, wanted.distortion)
+
+
+@pytest.mark.parametrize(
+    ("meta", "drop", "message"),
+    [
+        ({}, ("w",), "must state one w and h"),
+        ({"h": 0}, (), "must state one w and h"),
+        ({"frames": []}, (), "has no frames"),
+        ({}, ("fl_x",), "neither fl_x nor camera_angle_x"),
+    ],
+)
+def test_cameras_that_a_file_does_not_tell(meta, drop, message, tmp_path):
+    folder = _write(tmp_path / "c", meta=meta, drop=drop)
+    with pytest.raises(ValueError, match=message):
+        load_cameras(folder)
+
+
+def test_cameras_of_two_sizes_are_refused(tmp_path):
+    frames = [{"file_path": f"{i}.png", "transform_matrix": pose, "w": 16 + i} for i, pose in enumerate(POSES)]
+    with pytest.raises(ValueError, match=r"one w and h .*\(16, 12\), \(17, 12\)"):
+        load_cameras(_write(tmp_path / "c", meta={"frames": frames}))
 
 
 def test_normalised_origins_fill_the_unit_box_and_the_transform_says_how(tmp_path):

@@ -1,3 +1,5 @@
+import json
+
 import numpy as np
 import pytest
 
@@ -47,6 +49,7 @@ def test_wrong_words_exit_with_two(words, capsys):
     ("words", "message"),
     [
         (["clean", "absent.npz"], "unghost clean: load_grid: no file absent.npz"),
+        (["clean", "absent.npz", "--cameras", "absent"], "unghost clean: load_grid: no file absent.npz"),
         (["curate", "absent", "--out", "x"], "unghost curate: load_recipe: absent is neither a file"),
         (["curate", "procedural", "--out", "x", "--count", "0"], "unghost curate: curate: count must be >= 1, got 0"),
         (["train", "absent", "--out", "x"], "unghost train: expand_shards: absent is not a shard and holds none"),
@@ -122,3 +125,27 @@ def test_grid_files_round_trip_and_refuse(tmp_path):
     np.savez(path, density=np.ones(3), aabb=box)
     with pytest.raises(ValueError, match=r"must have shape \(X, Y, Z\), got \(3,\)"):
         load_grid(path)
+
+
+def test_clean_hands_the_cameras_of_a_transforms_file_on(tmp_path, monkeypatch, capsys):
+    from unghost import cleaning
+    from unghost.regularizer.keep_mask import KeepMask
+
+    pose = [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
+    frames = [{"file_path": f"{name}.png", "transform_matrix": pose} for name in "ab"]
+    (tmp_path / "transforms.json").write_text(json.dumps({"w": 8, "h": 6, "fl_x": 7.0, "frames": frames}))
+    aabb = np.array([[0.0, 0, 0], [1, 1, 1]])
+    save_grid(tmp_path / "grid.npz", np.ones((4, 4, 4), np.float32), aabb)
+    told = []
+
+    def recorder(density_fn, box, *, cameras, **options):
+        told.append(cameras)
+        details = {"occupied": 64, "removed": 0, "faint_removed": 0, "settings": {}, "regions": [], "region_count": 0}
+        return KeepMask(np.asarray(box), 0.25, np.ones((4, 4, 4), bool), details)
+
+    monkeypatch.setattr(cleaning, "clean", recorder)
+    assert cli.main(["clean", str(tmp_path / "grid.npz"), "--cameras", str(tmp_path)]) == 0, capsys.readouterr()
+    assert cli.main(["clean", str(tmp_path / "grid.npz")]) == 0
+    assert len(told[0]) == 2
+    assert told[0].origins[0].tolist() == [1, 2, 3]
+    assert told[1] is None
