@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..core.cameras import Cameras
+from ..core.distortion import distortion
 from .kinds import TrainableField
 from .rendering import Rendering, Sampling, render_rays
 
@@ -54,13 +55,8 @@ class TrainingConfig:
 
 def distortion_loss(rendering: Rendering) -> Tensor:
     """mip-NeRF 360, eq. 15, per ray ``(N,)``, on distances squashed to [0, 1) by ``t / (1 + t)``; O(samples)."""
-    squashed = rendering.edges / (1.0 + rendering.edges)
-    width = squashed[:, 1:] - squashed[:, :-1]
-    middle = squashed[:, :-1] + width / 2
-    weights = rendering.weights
-    before = torch.cumsum(weights, dim=1) - weights
-    moment = torch.cumsum(weights * middle, dim=1) - weights * middle
-    return (2.0 * weights * (middle * before - moment)).sum(1) + (weights**2 * width).sum(1) / 3.0
+    spread: Tensor = distortion(rendering.weights, rendering.edges / (1.0 + rendering.edges))
+    return spread
 
 
 def gather_rays(cameras: Cameras, images: NDArray[np.float32]) -> tuple[Tensor, Tensor, Tensor]:
