@@ -6,9 +6,12 @@ import dataclasses
 import json
 import os
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional, UseAppendAction
+
+if TYPE_CHECKING:
+    from .prior.config import TrainConfig
 
 ONLINE_SEED = 1 << 32  # plus the run's seed: what is made online is in no shard
 
@@ -73,6 +76,23 @@ def _online(specs: list[str], *, seed: int, workers: int, mesh_root: Path | None
     return sources
 
 
+def _configured(file: Path | None, size: str | None, channels: tuple[str, ...], given: dict[str, Any]) -> TrainConfig:
+    """The configuration of a file, or the default one, with what the command line says in its place."""
+    from .prior.config import TrainConfig
+    from .prior.network import SIZES, NetworkConfig
+
+    base = TrainConfig() if file is None else TrainConfig.from_dict(json.loads(file.read_text(encoding="utf-8")))
+    if size is not None and size not in SIZES:
+        raise ValueError(f"train: --size must be one of {', '.join(SIZES)}, got {size!r}")
+    network = base.network if size is None else dataclasses.replace(SIZES[size], channels=base.network.channels)
+    if channels:
+        if not isinstance(network, NetworkConfig):
+            raise ValueError(f"train: --channels needs a restoration network, --config has a {type(network).__name__}")
+        network = dataclasses.replace(network, channels=channels)
+    said = {key: value for key, value in given.items() if value is not None}
+    return dataclasses.replace(base, **said, network=network)
+
+
 def train(
     shards: Positional[list[str]],
     out: Path,
@@ -126,8 +146,6 @@ def train(
         resume: go on where a killed run stopped.
     """
     from .prior.allocator import keep_freed_memory
-    from .prior.config import TrainConfig
-    from .prior.network import SIZES, NetworkConfig
     from .prior.train import train as run
 
     keep_freed_memory()
@@ -136,16 +154,7 @@ def train(
         "learning_rate": learning_rate, "precision": precision, "device": device, "threads": threads,
         "threshold_from": threshold_from, "init_from": init_from, "drop_channels": drop_channels,
     }  # fmt: skip
-    base = TrainConfig() if config is None else TrainConfig.from_dict(json.loads(config.read_text(encoding="utf-8")))
-    if size is not None and size not in SIZES:
-        raise ValueError(f"train: --size must be one of {', '.join(SIZES)}, got {size!r}")
-    network = base.network if size is None else dataclasses.replace(SIZES[size], channels=base.network.channels)
-    if channels:
-        if not isinstance(network, NetworkConfig):
-            raise ValueError(f"train: --channels needs a restoration network, --config has a {type(network).__name__}")
-        network = dataclasses.replace(network, channels=channels)
-    given["network"] = network
-    chosen = dataclasses.replace(base, **{key: value for key, value in given.items() if value is not None})
+    chosen = _configured(config, size, channels, given)
     result = run(
         chosen, train_shards=[pair for spec in shards for pair in expand_shards(spec)],
         validation_shards=_named_shards(validation), out=out, resume=resume, progress=True,
