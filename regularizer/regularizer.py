@@ -119,7 +119,7 @@ class DensityRegularizer:
 
         Returns:
             ``{"dsds": …, "visibility": …}``: scalars (float64, so that no finite density overflows), exactly zero
-            where switched off.
+            where switched off, and at the steps between (``every``).
 
         Raises:
             TypeError, ValueError: what a callable returned is no tensor, of the wrong shape, NaN, infinite, negative.
@@ -134,7 +134,10 @@ class DensityRegularizer:
                 raise TypeError(f"DensityRegularizer: density_fn must be callable, got {type(field).__name__}")
         device = torch.device(self.device if self.device is not None else field_device(fields[0]) or "cpu")
         self.report = Counter()
-        losses = {"dsds": self._dsds(fields, device), "visibility": self._visibility(fields, device)}
+        if self.step % self.settings.every:
+            losses = {name: torch.zeros((), dtype=wide_dtype(device), device=device) for name in ("dsds", "visibility")}
+        else:
+            losses = {"dsds": self._dsds(fields, device), "visibility": self._visibility(fields, device)}
         self.totals.update(self.report)
         self.step += 1
         return losses

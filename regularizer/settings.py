@@ -21,6 +21,7 @@ class RegularizerSettings:
 
     Attributes:
         cubes: cubes a step (40: the paper).
+        every: calls from one that does something to the next; those between cost nothing and return zeros.
         edge_range: lowest and highest cube edge as fractions of the scene extent; None: .5-1.25 field cells a
             voxel where ``field_pitch`` is known, else the paper's .01-.1.
         strategy: ``"mixed"``, ``"importance"`` or ``"uniform"`` cube centres.
@@ -46,6 +47,7 @@ class RegularizerSettings:
     """
 
     cubes: int = 40
+    every: int = 1
     edge_range: tuple[float, float] | None = None
     strategy: Strategy = "mixed"
     uniform_share: float = 0.25
@@ -71,6 +73,7 @@ class RegularizerSettings:
     def __post_init__(self) -> None:
         rules: dict[str, tuple[bool, str]] = {
             "cubes": (self.cubes >= 0, ">= 0"),
+            "every": (self.every >= 1, ">= 1"),
             "visibility_samples": (self.visibility_samples >= 0, ">= 0"),
             "light_steps": (self.light_steps >= 1, ">= 1"),
             "min_views": (self.min_views >= 1, ">= 1"),

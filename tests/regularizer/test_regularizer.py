@@ -38,6 +38,23 @@ def test_a_constant_field_by_hand(kit, aabb, kind):
     assert ((fraction >= 32 * 0.125 * 0.5 / 2 - 1e-6) & (fraction <= 32 * 0.125 * 1.25 / 2 + 1e-6)).all()
 
 
+def test_calls_between_cost_nothing(kit, aabb):
+    asked = []
+
+    def density_fn(p):
+        asked.append(len(p))
+        return torch.full((len(p),), 2.0)
+
+    regularizer, denoiser = build(kit, aabb, kit.all_empty, every=3)
+    worth = [regularizer(density_fn)["dsds"].item() for _ in range(7)]
+    assert [value > 0 for value in worth] == [True, False, False, True, False, False, True]
+    assert len(denoiser.calls) == 3
+    before = len(asked)
+    regularizer(density_fn)
+    assert len(asked) == before
+    assert regularizer.step == 8
+
+
 def test_filling_by_hand(kit, aabb):
     level = torch.tensor(1.0, requires_grad=True)
     rule = OccupancyRule("opacity", 0.2)
