@@ -22,11 +22,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     import tyro
 
-    from . import commands, commands_prior, commands_recipes, commands_sample
+    from . import commands, commands_masks, commands_prior, commands_recipes, commands_sample
 
     verbs: dict[str, Callable[..., Any]] = {
         "demo": commands.demo,
         "clean": commands.clean,
+        "masks": commands_masks.masks,
         "bench": commands.bench,
         "curate": commands_recipes.curate,
         "harvest": commands_recipes.harvest,
