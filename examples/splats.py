@@ -2,7 +2,7 @@
 
     python examples/splats.py [scene.ply]
 
-Without an argument, a scene that it makes itself: a pedestal with a vase on it, and floaters. Needs no torch.
+The same as ``unghost clean scene.ply``. Without an argument, a scene that it makes itself: a pedestal with a vase on it, and floaters. Needs no torch.
 """
 
 from __future__ import annotations
@@ -12,9 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from unghost import clean
-from unghost.fields.splat_ply import read_splat_ply, write_splat_ply
-from unghost.fields.splats import SplatField
+from unghost.fields.splat_ply import read_splat_ply
+from unghost.splat_cleaning import clean_ply
 
 NAMES = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *(f"scale_{i}" for i in range(3)),
          *(f"rot_{i}" for i in range(4)), "made_as"]  # fmt: skip
@@ -53,18 +52,12 @@ def main() -> None:
     if len(sys.argv) == 1:
         make(path)
 
-    splats = read_splat_ply(path)
-    gaussians = splats.gaussians()
-    aabb = gaussians.aabb(share=0.999)
-    pitch = float((aabb[1] - aabb[0]).max()) / 64
-    field = SplatField(gaussians, pitch=pitch)
-
-    mask = clean(field.density_fn, aabb, field_pitch=pitch)
-
-    keep = mask.keep(gaussians.means)
     target = path.with_name(path.stem + "_clean.ply")
-    write_splat_ply(target, splats, keep=keep, keep_score=keep.astype(np.float32))
-    print(f"{target}: {keep.sum():,} of {len(splats):,} Gaussians kept")
+    cleaned = clean_ply(path, target)
+
+    keep = cleaned.keep
+    print(f"{target}: {keep.sum():,} of {len(keep):,} Gaussians kept")
+    splats = read_splat_ply(path)
     if "made_as" in splats.rows.dtype.names:
         ghost = np.asarray(splats.rows["made_as"]) == 1
         print(f"{(~keep)[ghost].mean():.1%} of the floaters removed, {keep[~ghost].mean():.1%} of the rest kept")

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
@@ -25,24 +26,29 @@ def demo(out: Path = Path("out/demo"), seed: int = 0) -> None:
 
 
 def clean(
-    grid: Positional[Path],
-    out: Path | None = None,
+    source: Positional[Path],
+    out: Annotated[Path | None, arg(aliases=["-o"])] = None,
     keep: Path | None = None,
     cameras: Path | None = None,
     denoiser: str = "default",
     strength: float = 0.5,
+    resolution: int | None = None,
+    reach: float = 2.0,
     threads: Threads = 0,
 ) -> None:
-    """Clean a density grid: an .npz with density (X, Y, Z) per scene unit and aabb (2, 3), cubic cells.
+    """Clean a density grid (.npz: density (X, Y, Z) per scene unit, aabb (2, 3), cubic cells) or 3D Gaussians (.ply).
 
     Args:
-        grid: the file to clean; it is not changed.
-        out: the cleaned grid; GRID-clean.npz beside it if not given.
-        keep: the mask of what was kept, which undoes or repeats the cleaning; GRID-keep.npz if not given.
-        cameras: a transforms.json (nerfstudio's format) of the training photos, in the grid's own world; where few
+        source: the file to clean; it is not changed.
+        out: the cleaned grid or splats; NAME-clean beside it if not given. Every property of a splat is kept byte for
+            byte, and keep_score is added.
+        keep: the mask of what was kept, which undoes or repeats the cleaning; NAME-keep.npz if not given.
+        cameras: a transforms.json (nerfstudio's format) of the training photos, in the file's own world; where few
             or none of them look, ghosts are likelier. The photos themselves are not needed.
         denoiser: a shipped name or an .onnx file.
         strength: 0 removes nothing, 0.5 what the denoiser advises, 1 everything.
+        resolution: of splats, cells along the longest side of the box; by the splats' sizes if not given.
+        reach: of splats, how many times the scene's core (98 % of the opacity) is cleaned; what is beyond stays.
         threads: of onnxruntime; 0 leaves the choice to it.
     """
     from .cleaning import clean as clean_field
@@ -50,20 +56,43 @@ def clean(
     from .evaluation.captures import load_cameras
     from .grids import cell_pitch, grid_density_fn, load_grid, save_grid
 
-    density, aabb = load_grid(grid)
-    mask = clean_field(
-        grid_density_fn(density, aabb), aabb, denoiser=load_denoiser(denoiser, backend="onnx", threads=threads or None),
-        cameras=None if cameras is None else load_cameras(cameras), strength=strength,
-        field_pitch=cell_pitch(aabb, density.shape, caller="clean"),
-    )  # fmt: skip
-    out = out or grid.with_name(f"{grid.stem}-clean.npz")
-    keep = keep or grid.with_name(f"{grid.stem}-keep.npz")
-    save_grid(out, mask.apply_grid(density), aabb)
+    out = out or source.with_name(f"{source.stem}-clean{source.suffix}")
+    keep = keep or source.with_name(f"{source.stem}-keep.npz")
+    options: dict[str, Any] = {"strength": strength, "progress": _windows()}
+    if source.suffix != ".ply":
+        density, aabb = load_grid(source)
+    options["denoiser"] = load_denoiser(denoiser, backend="onnx", threads=threads or None)
+    options["cameras"] = None if cameras is None else load_cameras(cameras)
+    if source.suffix == ".ply":
+        from .splat_cleaning import clean_ply
+
+        found = clean_ply(source, out, resolution=resolution, reach=reach, **options)
+        mask = found.mask
+        print(f"removed {int((~found.keep).sum())} of {len(found.keep)} Gaussians ({(~found.keep).mean():.1%})")
+    else:
+        pitch = cell_pitch(aabb, density.shape, caller="clean")
+        mask = clean_field(grid_density_fn(density, aabb), aabb, field_pitch=pitch, **options)
+        save_grid(out, mask.apply_grid(density), aabb)
     keep.parent.mkdir(parents=True, exist_ok=True)
     mask.save(keep)
     summary = mask.summary()
     print(f"removed {summary['removed']} of {summary['occupied']} occupied cells ({summary['removed_share']:.1%})")
-    print(f"cleaned grid: {out}\nkeep mask: {keep}")
+    print(f"cleaned: {out}\nkeep mask: {keep}")
+
+
+def _windows() -> Callable[[int, int], None]:
+    """A progress bar of the windows that went through the denoiser, on stderr, gone when it is full."""
+    from tqdm import tqdm
+
+    bar = tqdm(unit="cube", dynamic_ncols=True, leave=False, disable=None)
+
+    def progress(done: int, total: int) -> None:
+        if done < bar.n:  # the next level begins
+            bar.reset()
+        bar.total = total
+        bar.update(done - bar.n)
+
+    return progress
 
 
 def bench(

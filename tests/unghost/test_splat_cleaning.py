@@ -1,0 +1,106 @@
+"""Splats through ``clean``: scores by hand, bytes untouched, a scene whose floaters are labelled."""
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from unghost import cli
+from unghost.core.manifest import Manifest
+from unghost.fields.splat_ply import Gaussians, read_splat_ply
+from unghost.regularizer.keep_mask import KeepMask
+from unghost.splat_cleaning import box_of, clean_ply, clean_splats, keep_scores, pitch_of
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """The example's own scene: a vase on a pedestal, 5 % floaters, labelled."""
+    spec = importlib.util.spec_from_file_location("splats_example", ROOT / "examples" / "splats.py")
+    example = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(example)
+    path = tmp_path_factory.mktemp("splats") / "scene.ply"
+    example.make(path)
+    return path
+
+
+class Constant:
+    """A denoiser with one opinion."""
+
+    kind = "numpy"
+
+    def __init__(self, value):
+        self.value, self.manifest = value, Manifest("constant")
+
+    def __call__(self, channels, timestep, edge_fraction):
+        return np.full_like(channels[:, :1], self.value)
+
+
+def test_scores_by_hand():
+    """Cells left of x = 0 are kept: a Gaussian whose long axis crosses the border loses one point of seven, or two."""
+    cells = np.zeros((8, 8, 8), dtype=bool)
+    cells[:4] = True
+    mask = KeepMask(np.array([[-1.0, -1, -1], [1, 1, 1]]), 0.25, cells)
+    turn = np.sqrt(0.5)
+    gaussians = Gaussians.create(
+        [[-0.5, 0.1, 0.1], [-0.1, 0.1, 0.1], [0.1, 0.1, 0.1], [-0.1, 0.1, 0.1], [5.0, 0, 0]],
+        [[0.05, 0.05, 0.05], [0.2, 0.01, 0.01], [0.2, 0.01, 0.01], [0.2, 0.01, 0.01], [0.1, 0.1, 0.1]],
+        [[1, 0, 0, 0], [1, 0, 0, 0], [1, 0, 0, 0], [turn, 0, 0, turn], [1, 0, 0, 0]],  # the fourth lies along y
+        np.zeros(5),
+    )
+    np.testing.assert_allclose(keep_scores(gaussians, mask), [1, 6 / 7, 1 / 7, 1, 1], atol=1e-6)
+
+
+def test_the_box_holds_what_hovers_about_the_scene_and_not_the_horizon():
+    rng = np.random.default_rng(0)
+    means = np.concatenate([rng.uniform(-1, 1, (2000, 3)), [[1.6, 0, 0], [300.0, 0, 0]]])
+    gaussians = Gaussians.create(means, np.full((2002, 3), 0.01), np.tile([1.0, 0, 0, 0], (2002, 1)), np.zeros(2002))
+    box = box_of(gaussians)
+    assert 1.6 < box[1, 0] < 2.5
+    assert box[0, 0] == pytest.approx(-1.01, abs=0.02)  # nothing is there to be cleaned
+    assert pitch_of(gaussians, box, None) == pytest.approx(0.02)
+    assert pitch_of(gaussians, box, 10) == pytest.approx((box[1] - box[0]).max() / 10)
+
+
+def test_one_opinion_keeps_or_removes_what_is_in_the_box(scene):
+    gaussians = read_splat_ply(scene).gaussians()
+    kept = clean_splats(gaussians, denoiser=Constant(1.0), resolution=32)
+    assert kept.keep.all()
+    assert (kept.keep_score == 1).all()
+    gone = clean_splats(gaussians, denoiser=Constant(-1.0), resolution=32)
+    assert gone.keep.mean() < 0.02
+    with pytest.raises(ValueError, match="resolution must be >= 8, got 4"):
+        clean_splats(gaussians, denoiser=Constant(1.0), resolution=4)
+
+
+def test_the_command_removes_floaters_and_touches_nothing_else(scene, tmp_path, capsys):
+    before, target = scene.read_bytes(), tmp_path / "clean.ply"
+    words = ["clean", str(scene), "-o", str(target), "--keep", str(tmp_path / "k.npz")]
+    assert cli.main(words) == 0, capsys.readouterr().err
+    assert "of 18900 Gaussians" in capsys.readouterr().out
+    assert scene.read_bytes() == before
+    rows, cleaned = read_splat_ply(scene).rows, read_splat_ply(target).rows
+    names = rows.dtype.names
+    assert cleaned.dtype.names == (*names, "keep_score")
+    place = {row.tobytes(): index for index, row in enumerate(rows)}
+    kept = np.array([place[row.tobytes()] for row in cleaned[list(names)].astype(rows.dtype)])
+    assert (np.diff(kept) > 0).all()  # in their order, every byte as it was
+    assert (np.asarray(cleaned["keep_score"]) >= 0.5).all()
+    ghost = np.asarray(rows["made_as"]) == 1
+    stays = np.zeros(len(rows), bool)
+    stays[kept] = True
+    assert (~stays)[ghost].mean() > 0.8
+    assert stays[~ghost].mean() > 0.95
+    KeepMask.load(tmp_path / "k.npz")
+
+
+def test_never_onto_itself_and_nothing_half_written(scene, tmp_path, capsys):
+    with pytest.raises(ValueError, match="is the file to clean; write to another"):
+        clean_ply(scene, scene)
+    bad = tmp_path / "bad.ply"
+    bad.write_bytes(scene.read_bytes()[:-7])
+    assert cli.main(["clean", str(bad)]) == 2
+    assert "unghost clean: " in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["bad.ply"]
