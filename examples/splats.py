@@ -2,7 +2,8 @@
 
     python examples/splats.py [scene.ply]
 
-The same as ``unghost clean scene.ply``. Without an argument, a scene that it makes itself: a pedestal with a vase on it, and floaters. Needs no torch.
+The same as ``unghost clean scene.ply``. Without an argument, a scene that it makes itself: a pedestal with a vase on
+it, and floaters. Needs no torch.
 """
 
 from __future__ import annotations
