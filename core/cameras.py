@@ -158,6 +158,23 @@ class Cameras:
         visible &= (pixels[..., 1] >= 0) & (pixels[..., 1] <= self.height)
         return pixels, depth, visible
 
+    def sees(self, indices: NDArray[np.integer], positions: NDArray[Any]) -> NDArray[np.bool_]:
+        """Whether camera ``indices[k]`` has ``positions[k]`` in view, by the rule of :meth:`project`: ``(K,)``."""
+        points, poses = np.asarray(positions, dtype=np.float64), self.camera_to_world[indices]
+        local = np.einsum("ka,kab->kb", points - poses[:, :, 3], poses[:, :, :3])
+        depth = -local[:, 2]
+        front = depth > 0
+        safe = np.where(front, depth, 1.0)
+        x, y = local[:, 0] / safe, -local[:, 1] / safe
+        radii = {bend.tobytes(): largest_radius(bend) for bend in np.unique(self.distortion, axis=0)}
+        radius = np.array([radii[bend.tobytes()] for bend in self.distortion])[indices]
+        front &= x * x + y * y < radius**2
+        x, y = np.where(front, x, 0.0), np.where(front, y, 0.0)
+        u, v = distort(x, y, self.distortion[indices].T)
+        fx, fy, cx, cy = self.intrinsics[indices].T
+        column, row = u * fx + cx, v * fy + cy
+        return np.asarray(front & (column >= 0) & (column <= self.width) & (row >= 0) & (row <= self.height))
+
     def view_count(
         self, positions: Any, *, depth_maps: NDArray[Any] | None = None, tolerance: float = 0.05
     ) -> NDArray[np.int64]:

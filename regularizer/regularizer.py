@@ -103,7 +103,10 @@ class DensityRegularizer:
                 f"DensityRegularizer: fill_threshold must be >= threshold={self.threshold}, got {self.fill_threshold}"
             )
         self.grid = ImportanceGrid(self.aabb, resolution=s.grid_resolution, decay=s.grid_decay)
-        self._views = ViewCounter(cameras, min_views=s.min_views) if cameras is not None and len(cameras) else None
+        self._views: ViewCounter | None = None
+        if cameras is not None and len(cameras):
+            reach = grow_box(self.aabb, s.visibility_reach)
+            self._views = ViewCounter(cameras, min_views=s.min_views, aabb=reach)
         self._viewing = viewing_cameras(cameras, denoiser.manifest.channels)
         self._rays = FollowedRays(denoiser.manifest.channels, cameras, self.aabb, every=s.light_steps)
         self.step = 0

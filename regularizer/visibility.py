@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core.aabb import as_aabb
 from ..core.cameras import Cameras
+from .view_grid import OPEN, ViewGrid
 
 FloatArray = NDArray[np.float64]
 PointKind = Literal["mixed", "rays", "uniform"]
@@ -84,17 +85,21 @@ class ViewCounter:
     """Counts views up to ``min_views`` and no further: points that are seen enough leave the race early.
 
     The answer to "seen by fewer than ``min_views``" is exactly that of :meth:`Cameras.view_count`. Cameras
-    are asked in the order that settled most points so far, which fixed cameras make worth remembering.
+    are asked in the order that settled most points so far, which fixed cameras make worth remembering. In a box
+    that is known beforehand most cells are settled once and for all (:class:`.view_grid.ViewGrid`).
 
     Args:
         cameras: fixed.
         min_views: where counting stops, >= 1.
+        aabb: ``(2, 3)``, where most points will be; None for no cells.
     """
 
-    def __init__(self, cameras: Cameras, *, min_views: int = 1) -> None:
+    def __init__(self, cameras: Cameras, *, min_views: int = 1, aabb: ArrayLike | None = None) -> None:
         if min_views < 1:
             raise ValueError(f"ViewCounter: min_views must be >= 1, got {min_views}")
         self.min_views = int(min_views)
+        box = None if aabb is None else as_aabb(aabb, caller="ViewCounter")
+        self._grid = None if box is None else ViewGrid(cameras, box, min_views=self.min_views)
         self._single = [cameras.select(index) for index in range(len(cameras))]
         self._settled = np.zeros(len(cameras))
 
@@ -105,6 +110,10 @@ class ViewCounter:
             raise ValueError(f"ViewCounter: positions must have shape (N, 3), got {points.shape}")
         counts = np.zeros(len(points), dtype=np.int64)
         open_ = np.arange(len(points))
+        if self._grid is not None:
+            counts = self._grid.count(points)
+            open_ = np.flatnonzero(counts == OPEN)
+            counts[open_] = 0
         for index in np.argsort(-self._settled, kind="stable"):
             if open_.size == 0:
                 break

@@ -5,6 +5,7 @@ import pytest
 
 from unghost.core.cameras import Cameras
 from unghost.core.frames import random_rotations
+from unghost.regularizer.view_grid import OPEN, ViewGrid
 from unghost.regularizer.visibility import (
     ViewCounter,
     camera_sphere,
@@ -33,6 +34,45 @@ def test_counter_agrees_with_the_full_count(min_views):
         assert ((counts < min_views) == (full < min_views)).all()
         assert (counts <= full).all()
         assert 0 < (full < min_views).mean() < 1
+
+
+LENSES = {
+    "pinhole": np.zeros(6),
+    "phone": np.array([0.05, -0.02, 0, 0, 1e-3, 0]),
+    "barrel": np.array([-0.12, 0.02, 0, 0, 0, 0]),
+    "folding": np.array([-0.9, 0, 0, 0, 0, 0]),  # no border to undistort: every point is left to the exact test
+}
+
+
+@pytest.mark.parametrize("lens", LENSES)
+@pytest.mark.parametrize("min_views", [1, 2, 5])
+def test_cells_settle_nothing_wrongly(lens, min_views):
+    plain = cameras()
+    rig = Cameras.create(plain.camera_to_world, plain.intrinsics, plain.width, plain.height, LENSES[lens])
+    rng = np.random.default_rng(1)
+    points = np.concatenate([
+        rng.uniform(BOX[0], BOX[1], (4000, 3)), rng.uniform(-3, 3, (1000, 3)), rig.origins, BOX,
+        rig.origins - 1e-7, np.full((1, 3), 1e30),
+    ])  # fmt: skip
+    full = rig.view_count(points)
+    for counter in (ViewCounter(rig, min_views=min_views), ViewCounter(rig, min_views=min_views, aabb=BOX)):
+        np.testing.assert_array_equal(np.minimum(counter(points), min_views), np.minimum(full, min_views))
+    assert ViewCounter(rig, aabb=BOX)(np.zeros((0, 3))).shape == (0,)
+
+
+def test_most_of_a_box_is_settled_beforehand():
+    grid = ViewGrid(cameras(), BOX, min_views=1)
+    assert (grid.cells == OPEN).mean() < 0.5
+    assert set(np.unique(grid.cells)) == {OPEN, 0, 1}
+
+
+def test_single_pairs_are_seen_as_whole_cameras_see():
+    rig = cameras()
+    points = np.random.default_rng(2).uniform(-2, 2, (500, 3))
+    index = np.arange(500) % len(rig)
+    wanted = [bool(rig.project(camera, point)[2]) for camera, point in zip(index, points)]
+    assert rig.sees(index, points).tolist() == wanted
+    assert 20 < sum(wanted) < 480
 
 
 def test_counter_is_quick():

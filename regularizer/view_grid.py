@@ -1,0 +1,151 @@
+"""Who sees what, settled a cell at a time: most of a scene is seen by enough fixed cameras, or by none, cell by cell.
+
+A cell wholly inside a frustum is seen by that camera, one wholly beyond a side of it is not. With distortion a
+frustum's sides are bent: each is put between two flat ones (the rectangles inside and about the undistorted image).
+Cells in which cameras disagree are cut in eight, twice over; points in what is open then are held against the flat
+sides themselves, and the few that lie between the inner and the outer one are left to the exact test.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.cameras import Cameras, distort, largest_radius, undistort
+from ..core.cube_views import BORDER_POINTS
+
+COARSEST, LEVELS = 8, 3  # cells along an axis at first, and how often: up to 32
+CHUNK = 4096  # cells looked at together
+SLACK = 1e-5  # of the distances involved: float32 rounds
+OPEN = -1
+FloatArray = NDArray[np.float64]
+
+
+def image_rectangles(cameras: Cameras) -> tuple[FloatArray, FloatArray]:
+    """Normalised image coordinates (x right, y down) that a camera surely has in view, and those it may have.
+
+    Returns:
+        two ``(N, 4)``: left, right, top, bottom. Where the lens cannot be undistorted to its border, the first is
+        empty (NaN) and the second everything (infinite).
+    """
+    fx, fy, cx, cy = cameras.intrinsics.T
+    plain = np.stack([-cx / fx, (cameras.width - cx) / fx, -cy / fy, (cameras.height - cy) / fy], axis=1)
+    sure, possible = plain.copy(), plain.copy()
+    along, cache = np.linspace(0.0, 1.0, BORDER_POINTS), dict[bytes, tuple[FloatArray, FloatArray]]()
+    for index in np.flatnonzero(cameras.distortion.any(axis=1)):
+        key = cameras.intrinsics[index].tobytes() + cameras.distortion[index].tobytes()
+        if key not in cache:
+            cache[key] = _bent_rectangles(plain[index], cameras.distortion[index], along)
+        sure[index], possible[index] = cache[key]
+    return sure, possible
+
+
+def _bent_rectangles(plain: FloatArray, bend: FloatArray, along: FloatArray) -> tuple[FloatArray, FloatArray]:
+    left, right, top, bottom = plain
+    rows, columns = top + along * (bottom - top), left + along * (right - left)
+    x = np.stack([np.full_like(rows, left), np.full_like(rows, right), columns, columns])
+    y = np.stack([rows, rows, np.full_like(columns, top), np.full_like(columns, bottom)])
+    with np.errstate(over="ignore", invalid="ignore"):
+        u, v = undistort(x, y, bend)
+        missed = np.abs(np.stack(distort(u, v, bend)) - np.stack([x, y])).max()
+        radius = np.sqrt((u * u + v * v).max())
+    if not (missed < 1e-6 and radius < 0.999 * largest_radius(bend)):
+        return np.full(4, np.nan), np.array([-np.inf, np.inf, -np.inf, np.inf])
+    sides = np.stack([u[0], u[1], v[2], v[3]])
+    margin = np.abs(np.diff(sides, n=2, axis=1)).max(axis=1) + 1e-6  # between two samples the border bends no further
+    low, high = sides.min(axis=1) - margin, sides.max(axis=1) + margin
+    sure = np.array([high[0], low[1], high[2], low[3]])
+    corner = np.hypot(np.abs(sure[:2]).max(), np.abs(sure[2:]).max())
+    possible = np.array([low[0], high[1], low[2], high[3]])
+    return (sure if corner < largest_radius(bend) else np.full(4, np.nan)), possible
+
+
+def _planes(cameras: Cameras, rectangles: FloatArray) -> NDArray[np.float32]:
+    """``(4, N, 4)``: unit normal and offset of each side; a point ``(p, 1)`` is within it if the product is >= 0."""
+    bounded = np.isfinite(rectangles)
+    left, right, top, bottom = np.where(bounded, rectangles, 0.0).T
+    one, zero = np.ones_like(left), np.zeros_like(left)
+    local = np.array([[one, zero, left], [-one, zero, -right], [zero, -one, top], [zero, one, -bottom]])
+    local *= bounded.T[:, None]  # an unbounded side: 0 >= 0
+    normals = np.einsum("nab,sbn->sna", cameras.camera_to_world[:, :, :3], local)
+    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
+    offsets = -np.einsum("sna,na->sn", normals, cameras.origins)
+    return np.concatenate([normals, offsets[..., None]], axis=-1).astype(np.float32)
+
+
+class ViewGrid:
+    """A box cut into 32^3 cells; each holds the views of all its points, up to ``min_views``, or ``OPEN``.
+
+    Args:
+        cameras: fixed.
+        aabb: ``(2, 3)``.
+        min_views: where counting stops.
+    """
+
+    def __init__(self, cameras: Cameras, aabb: FloatArray, *, min_views: int) -> None:
+        self._cameras = cameras
+        self.aabb, self.min_views = np.asarray(aabb, dtype=np.float64), min_views
+        sure, possible = image_rectangles(cameras)
+        self._reliable = np.isfinite(sure).all(axis=1)
+        self._inner, self._outer = _planes(cameras, sure), _planes(cameras, possible)
+        reach = np.abs(self.aabb).max() + np.abs(cameras.origins).max(initial=0.0)
+        self._slack = np.float32(SLACK * reach)
+        self.cells = np.full((COARSEST << (LEVELS - 1),) * 3, OPEN, dtype=np.int16)
+        open_ = np.stack(np.meshgrid(*[np.arange(COARSEST)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+        for level in range(LEVELS):
+            open_ = self._settle(open_, level)
+            children = np.stack(np.meshgrid(*[np.arange(2)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+            open_ = (2 * open_[:, None] + children).reshape(-1, 3)
+
+    def _settle(self, cells: NDArray[np.int64], level: int) -> NDArray[np.int64]:
+        """Write down those cells of a level whose points all have the same count; the others come back."""
+        side = (self.aabb[1] - self.aabb[0]) / (COARSEST << level)
+        left = []
+        for start in range(0, len(cells), CHUNK):
+            part = cells[start : start + CHUNK]
+            every, any_ = self._bounds(self.aabb[0] + (part + 0.5) * side, side / 2)
+            least, most = every.sum(axis=0), any_.sum(axis=0)
+            settled = (least >= self.min_views) | (least == most)
+            size = 1 << (LEVELS - 1 - level)
+            blocks = self.cells.reshape(*(n for _ in range(3) for n in (COARSEST << level, size)))
+            x, y, z = part[settled].T
+            blocks[x, :, y, :, z, :] = np.minimum(least[settled], self.min_views)[:, None, None, None]
+            left.append(part[~settled])
+        return np.concatenate(left) if left else cells[:0]
+
+    def _bounds(self, centers: FloatArray, half: FloatArray) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Which cameras see every point of each box about ``centers (M, 3)``, and which may see any; ``(N, M)``."""
+        places = np.concatenate([centers.T, np.ones((1, len(centers)))]).astype(np.float32)
+        extent = half.astype(np.float32)
+        every = np.ones((len(self._cameras), len(centers)), dtype=bool)
+        every[~self._reliable] = False
+        any_ = np.ones_like(every)
+        for inner, outer in zip(self._inner, self._outer):
+            every &= inner @ places >= (np.abs(inner[:, :3]) @ extent + self._slack)[:, None]
+            any_ &= outer @ places >= -(np.abs(outer[:, :3]) @ extent + self._slack)[:, None]
+        return every, any_
+
+    def count(self, positions: FloatArray) -> NDArray[np.int64]:
+        """``min(view count, min_views)`` of points ``(N, 3)``, ``OPEN`` outside the box; ``(N,)``."""
+        count = self.cells.shape[0]
+        scale = count / (self.aabb[1] - self.aabb[0])
+        inside, index = np.ones(len(positions), dtype=bool), np.zeros(len(positions), dtype=np.int32)
+        with np.errstate(invalid="ignore", over="ignore"):
+            for axis in range(3):
+                local = ((positions[:, axis] - self.aabb[0, axis]) * scale[axis]).astype(np.float32)
+                inside &= (local >= 0) & (local < count)
+                index = index * count + local.astype(np.int32)
+        index[~inside] = 0
+        found = self.cells.reshape(-1)[index].astype(np.int64)
+        found[~inside] = OPEN
+        left = np.flatnonzero((found == OPEN) & inside)
+        for start in range(0, len(left), CHUNK):
+            part = left[start : start + CHUNK]
+            every, any_ = self._bounds(positions[part], np.zeros(3))
+            total = every.sum(axis=0)
+            camera, point = np.nonzero((any_ & ~every)[:, unsure := total < self.min_views])
+            points = np.flatnonzero(unsure)[point]
+            seen = self._cameras.sees(camera, positions[part][points])
+            total += np.bincount(points[seen], minlength=len(part))
+            found[part] = np.minimum(total, self.min_views)
+        return found
