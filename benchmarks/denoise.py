@@ -176,7 +176,7 @@ def measure(options: Options) -> dict[str, Any]:
         about = {"model": name} if name in files else {}
         for variant, used, timestep in variants_of(name, denoiser, options.timesteps):
             mine = [row_of(variant, used, cubes, timestep) | about for cubes in sets]
-            if about:
+            if about and variant == name:
                 mine = [
                     with_best_timestep(row, variant, used, cubes) if cubes.about.get("family") == MIXED else row
                     for row, cubes in zip(mine, sets)

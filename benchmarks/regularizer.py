@@ -1,0 +1,178 @@
+"""What the regularizer costs: a step of score distillation, and the question which points no camera sees.
+
+    python benchmarks/regularizer.py CAPTURE
+
+A step: 40 cubes of 32^3 of a fixed field (a room as a trilinear grid), with the shipped priors and with the paper's
+U-Net (random weights: its time does not depend on them) in the same harness; the field's own answers are timed apart.
+Visibility: 131,072 points in the box of a capture's cameras (its real, distorted lenses): every camera's exact test,
+nerfstudio's published algorithm (each camera in turn, pinholes, float32, torch; our own writing of it), and ours with
+and without the cells that settle most points. Writes docs/results/regularizer.json.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+from fit_cache import say
+from numpy.typing import NDArray
+
+from unghost import load_denoiser
+from unghost.core.cameras import Cameras
+from unghost.core.manifest import Manifest
+from unghost.core.results import build_results, write_results
+from unghost.demo_room import AABB, build_room
+from unghost.denoisers import shipped_names
+from unghost.evaluation.captures import load_capture
+from unghost.fields.trilinear import trilinear
+from unghost.prior.checkpoint import TorchDenoiser
+from unghost.prior.networks import build_network
+from unghost.prior.unet import UNetConfig
+from unghost.regularizer.regularizer import DensityRegularizer
+from unghost.regularizer.visibility import ViewCounter
+
+ROOT = Path(__file__).resolve().parents[1]
+POINTS = 131_072
+UNET = "the paper's U-Net"
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to time.
+
+    Attributes:
+        capture: folder of a capture: whose cameras to count.
+        repeats: of which the median is taken; the U-Net's step is run twice.
+        threads: of torch and onnxruntime.
+        out: where regularizer.json goes.
+    """
+
+    capture: tyro.conf.Positional[Path]
+    repeats: int = 9
+    threads: int = 2
+    out: Path = ROOT / "docs" / "results"
+
+
+def median_seconds(work: Callable[[], Any], repeats: int) -> float:
+    """Of a call, after one that does not count."""
+    work()
+    taken = []
+    for _ in range(repeats):
+        begun = time.perf_counter()
+        work()
+        taken.append(time.perf_counter() - begun)
+    return statistics.median(taken)
+
+
+class Room(torch.nn.Module):
+    """The demo's room, ghosts and all, as a differentiable field."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.pitch = build_room(0).pitch
+        density = torch.from_numpy(build_room(0).density).float()
+        self.side = max(density.shape)
+        padded = torch.zeros((self.side,) * 3)
+        padded[: density.shape[0], : density.shape[1], : density.shape[2]] = density
+        self.table = torch.nn.Parameter(padded.reshape(-1, 1))
+        self.low, self.size = torch.tensor(np.asarray(AABB)[0]).float(), self.side * self.pitch
+
+    def forward(self, positions: torch.Tensor) -> torch.Tensor:
+        """Densities ``(M, 1)``."""
+        unit = ((positions - self.low) / self.size).clamp(0.0, 1.0)
+        return torch.relu(trilinear(self.table, unit * (self.side - 1), self.side))
+
+
+def step_rows(options: Options) -> list[dict[str, Any]]:
+    """A step of score distillation, forward and backward, by denoiser."""
+    room, rows = Room(), []
+    denoisers: dict[str, Any] = {
+        name: load_denoiser(name, backend="onnx", threads=options.threads) for name in shipped_names()
+    }
+    unet = build_network(UNetConfig())
+    denoisers[UNET] = TorchDenoiser(unet, Manifest("unet", family="diffusion", default_timestep=50))
+    for name, denoiser in denoisers.items():
+        rows.append(step_row(name, denoiser, room, 1 if name == UNET else options.repeats))
+        say(f"{name}: {rows[-1]['seconds']:.3f} s a step, {rows[-1]['seconds_of_queries']:.3f} s of it the field's")
+    return rows
+
+
+def step_row(name: str, denoiser: Any, room: Room, repeats: int) -> dict[str, Any]:
+    """One denoiser; the field's forward and its share of the backward are timed without it, too."""
+    regularizer = DensityRegularizer(denoiser, aabb=AABB, field_pitch=room.pitch, skip_empty=False)
+    asked: list[torch.Tensor] = []
+
+    def noted(positions: torch.Tensor) -> torch.Tensor:
+        asked.append(positions)
+        return room(positions)
+
+    def step() -> None:
+        room.zero_grad()
+        asked.clear()
+        regularizer(noted)["dsds"].backward()  # type: ignore[no-untyped-call]
+
+    def queries() -> None:
+        room.zero_grad()
+        torch.cat([room(positions) for positions in asked]).mean().backward()
+
+    seconds = median_seconds(step, repeats)
+    alone = median_seconds(queries, repeats)
+    return {"method": f"dsds step, {name}", "cubes": regularizer.settings.cubes, "seconds": seconds,
+            "seconds_of_queries": alone, "seconds_beside": seconds - alone}  # fmt: skip
+
+
+def nerfstudio_count(cameras: Cameras, points: torch.Tensor) -> torch.Tensor:
+    """Frustum by frustum in float32, lenses straight: what nerfstudio's visibility field does."""
+    total = torch.zeros(len(points), dtype=torch.int64)
+    for pose, lens in zip(cameras.camera_to_world, cameras.intrinsics):
+        rotation, origin = torch.from_numpy(pose[:, :3]).float(), torch.from_numpy(pose[:, 3]).float()
+        fx, fy, cx, cy = (float(value) for value in lens)
+        x, y, z = ((points - origin) @ rotation).unbind(-1)
+        u, v = fx * x / -z + cx, -fy * y / -z + cy
+        total += (z < 0) & (u >= 0) & (u <= cameras.width) & (v >= 0) & (v <= cameras.height)
+    return total
+
+
+def visibility_rows(options: Options) -> list[dict[str, Any]]:
+    """Seconds for all points, tests a second, and how many answers differ from the exact ones."""
+    cameras = load_capture(options.capture).cameras
+    box = np.array([[-1.0] * 3, [1.0] * 3])
+    points = np.random.default_rng(0).uniform(box[0], box[1], (POINTS, 3))
+    single, cached = torch.from_numpy(points).float(), ViewCounter(cameras, aabb=box)
+    ways: dict[str, Callable[[], NDArray[Any]]] = {
+        "every camera, exact": lambda: cameras.view_count(points),
+        "nerfstudio's algorithm": lambda: nerfstudio_count(cameras, single).numpy(),
+        "ours, camera by camera": lambda: ViewCounter(cameras)(points),
+        "ours, cells, built each time": lambda: ViewCounter(cameras, aabb=box)(points),
+        "ours, cells": lambda: cached(points),
+    }
+    truth, rows = cameras.view_count(points) > 0, []
+    for name, way in ways.items():
+        seconds = median_seconds(way, options.repeats)
+        rows.append({"method": f"visibility, {name}", "points": POINTS, "cameras": len(cameras), "seconds": seconds,
+                     "tests_per_second": POINTS * len(cameras) / seconds,
+                     "disagreement": float(((way() > 0) != truth).mean())})  # fmt: skip
+        say(f"{name}: {seconds * 1e3:.1f} ms, {rows[-1]['tests_per_second'] / 1e6:.0f} M tests/s, "
+            f"{rows[-1]['disagreement']:.2%} differ")  # fmt: skip
+    return rows
+
+
+def main() -> None:
+    options = tyro.cli(Options, description=__doc__)
+    torch.set_num_threads(options.threads)
+    rows = [*visibility_rows(options), *step_rows(options)]
+    command = f"python benchmarks/regularizer.py {options.capture.resolve().name}"
+    write_results(
+        options.out / "regularizer.json", build_results(rows, command=command, seeds=[0], threads=options.threads)
+    )
+
+
+if __name__ == "__main__":
+    main()
