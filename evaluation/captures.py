@@ -142,9 +142,12 @@ def load_cameras(path: str | Path) -> Cameras:
         path: the file, or a folder that holds one. It must state ``w`` and ``h`` (for all frames alike).
 
     Raises:
+        FileNotFoundError: there is none.
         ValueError: what is wrong with the file.
     """
     file = Path(path) / "transforms.json" if Path(path).is_dir() else Path(path)
+    if not file.is_file():
+        raise FileNotFoundError(f"load_cameras: no file {file}")
     meta = _read_json(file)
     frames, names, poses = _posed(meta, file)
     merged = [{**meta, **frame} for frame in frames]

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
+
+if TYPE_CHECKING:
+    from .regularizer.keep_mask import KeepMask
 
 Threads = Annotated[int, arg(help="of onnxruntime; 0 leaves the choice to it.")]
 
@@ -29,6 +32,7 @@ def clean(
     source: Positional[Path],
     out: Annotated[Path | None, arg(aliases=["-o"])] = None,
     keep: Path | None = None,
+    preview: Path | None = None,
     cameras: Path | None = None,
     denoiser: str = "default",
     strength: float = 0.5,
@@ -43,6 +47,8 @@ def clean(
         out: the cleaned grid or splats; NAME-clean beside it if not given. Every property of a splat is kept byte for
             byte, and keep_score is added.
         keep: the mask of what was kept, which undoes or repeats the cleaning; NAME-keep.npz if not given.
+        preview: a PNG to write instead of all that: what would stay and what would go, from three sides; the regions
+            that would go are listed.
         cameras: a transforms.json (nerfstudio's format) of the training photos, in the file's own world; where few
             or none of them look, ghosts are likelier. The photos themselves are not needed.
         denoiser: a shipped name or an .onnx file.
@@ -51,33 +57,51 @@ def clean(
         reach: of splats, how many times the scene's core (98 % of the opacity) is cleaned; what is beyond stays.
         threads: of onnxruntime; 0 leaves the choice to it.
     """
-    from .cleaning import clean as clean_field
     from .denoisers import load_denoiser
     from .evaluation.captures import load_cameras
-    from .grids import cell_pitch, grid_density_fn, load_grid, save_grid
 
-    out = out or source.with_name(f"{source.stem}-clean{source.suffix}")
-    keep = keep or source.with_name(f"{source.stem}-keep.npz")
-    options: dict[str, Any] = {"strength": strength, "progress": _windows()}
-    if source.suffix != ".ply":
-        density, aabb = load_grid(source)
-    options["denoiser"] = load_denoiser(denoiser, backend="onnx", threads=threads or None)
-    options["cameras"] = None if cameras is None else load_cameras(cameras)
+    options: dict[str, Any] = {
+        "denoiser": load_denoiser(denoiser, backend="onnx", threads=threads or None), "strength": strength,
+        "cameras": None if cameras is None else load_cameras(cameras), "progress": _windows(),
+    }  # fmt: skip
+    target = None if preview else out or source.with_name(f"{source.stem}-clean{source.suffix}")
     if source.suffix == ".ply":
-        from .splat_cleaning import clean_ply
-
-        found = clean_ply(source, out, resolution=resolution, reach=reach, **options)
-        mask = found.mask
-        print(f"removed {int((~found.keep).sum())} of {len(found.keep)} Gaussians ({(~found.keep).mean():.1%})")
+        mask, density_fn = _clean_splats(source, target, resolution=resolution, reach=reach, **options)
     else:
-        pitch = cell_pitch(aabb, density.shape, caller="clean")
-        mask = clean_field(grid_density_fn(density, aabb), aabb, field_pitch=pitch, **options)
-        save_grid(out, mask.apply_grid(density), aabb)
+        mask, density_fn = _clean_grid(source, target, **options)
+    if preview:
+        from .removal_preview import region_table, write_preview
+
+        write_preview(preview, mask, density_fn)
+        print(f"{region_table(mask)}\nlook at {preview}; nothing was changed")
+        return
+    keep = keep or source.with_name(f"{source.stem}-keep.npz")
     keep.parent.mkdir(parents=True, exist_ok=True)
     mask.save(keep)
     summary = mask.summary()
     print(f"removed {summary['removed']} of {summary['occupied']} occupied cells ({summary['removed_share']:.1%})")
-    print(f"cleaned: {out}\nkeep mask: {keep}")
+    print(f"cleaned: {target}\nkeep mask: {keep}")
+
+
+def _clean_grid(source: Path, target: Path | None, **options: Any) -> tuple[KeepMask, Callable[[Any], Any]]:
+    from .cleaning import clean
+    from .grids import cell_pitch, grid_density_fn, load_grid, save_grid
+
+    density, aabb = load_grid(source)
+    density_fn = grid_density_fn(density, aabb)
+    mask = clean(density_fn, aabb, field_pitch=cell_pitch(aabb, density.shape, caller="clean"), **options)
+    if target is not None:
+        save_grid(target, mask.apply_grid(density), aabb)
+    return mask, density_fn
+
+
+def _clean_splats(source: Path, target: Path | None, **options: Any) -> tuple[KeepMask, Callable[[Any], Any]]:
+    from .splat_cleaning import clean_ply
+
+    found = clean_ply(source, target, **options)
+    gone = int((~found.keep).sum())
+    print(f"{gone} of {len(found.keep)} Gaussians ({gone / max(len(found.keep), 1):.1%}) are ghosts")
+    return found.mask, found.field.density_fn
 
 
 def _windows() -> Callable[[int, int], None]:

@@ -29,11 +29,13 @@ class CleanedSplats:
         keep_score: ``(N,)`` float32 in [0, 1]: which share of each lies in cells that are kept.
         keep: ``(N,)`` bool.
         mask: the cells, its preview (``mask.summary()``) and undo.
+        field: the density that was judged.
     """
 
     keep_score: NDArray[np.float32]
     keep: NDArray[np.bool_]
     mask: KeepMask
+    field: SplatField
 
 
 def keep_scores(gaussians: Gaussians, mask: KeepMask) -> NDArray[np.float32]:
@@ -88,18 +90,24 @@ def clean_splats(
     field = SplatField(gaussians, pitch=pitch)
     mask = clean(field.density_fn, aabb, denoiser=denoiser, field_pitch=pitch, **options)
     scores = keep_scores(gaussians, mask)
-    return CleanedSplats(scores, scores >= KEPT_FROM, mask)
+    return CleanedSplats(scores, scores >= KEPT_FROM, mask, field)
 
 
-def clean_ply(source: Path, target: Path, **options: Any) -> CleanedSplats:
+def clean_ply(source: Path, target: Path | None, **options: Any) -> CleanedSplats:
     """Clean a 3DGS ``.ply``: the kept rows, byte for byte, and their ``keep_score`` as one more property.
+
+    Args:
+        source: the file; it is not changed.
+        target: another; None to write nothing.
+        **options: of :func:`clean_splats`.
 
     Raises:
         ValueError: not a 3DGS .ply, one cut short, values that are not finite; ``target`` is ``source``.
     """
     splats = read_splat_ply(source)
-    if target.exists() and target.samefile(source):
+    if target is not None and target.exists() and target.samefile(source):
         raise ValueError(f"clean: {target} is the file to clean; write to another")
     found = clean_splats(splats.gaussians(), **options)
-    write_splat_ply(target, splats, keep=found.keep, keep_score=found.keep_score)
+    if target is not None:
+        write_splat_ply(target, splats, keep=found.keep, keep_score=found.keep_score)
     return found

@@ -79,7 +79,7 @@ def test_the_command_removes_floaters_and_touches_nothing_else(scene, tmp_path, 
     before, target = scene.read_bytes(), tmp_path / "clean.ply"
     words = ["clean", str(scene), "-o", str(target), "--keep", str(tmp_path / "k.npz")]
     assert cli.main(words) == 0, capsys.readouterr().err
-    assert "of 18900 Gaussians" in capsys.readouterr().out
+    assert "of 18900 Gaussians (4.8%) are ghosts" in capsys.readouterr().out
     assert scene.read_bytes() == before
     rows, cleaned = read_splat_ply(scene).rows, read_splat_ply(target).rows
     names = rows.dtype.names
@@ -94,6 +94,23 @@ def test_the_command_removes_floaters_and_touches_nothing_else(scene, tmp_path, 
     assert (~stays)[ghost].mean() > 0.8
     assert stays[~ghost].mean() > 0.95
     KeepMask.load(tmp_path / "k.npz")
+
+
+def test_a_preview_shows_and_changes_nothing(scene, tmp_path, capsys):
+    from matplotlib.image import imread
+
+    before = scene.read_bytes()
+    assert cli.main(["clean", str(scene), "--preview", str(tmp_path / "look.png")]) == 0, capsys.readouterr().err
+    printed = capsys.readouterr().out
+    assert "regions would go" in printed
+    assert "nothing was changed" in printed
+    assert scene.read_bytes() == before
+    assert [path.name for path in tmp_path.iterdir()] == ["look.png"]
+    picture = imread(tmp_path / "look.png")[..., :3]
+    orange = (picture[..., 0] > picture[..., 2] + 0.3).mean()
+    grey = ((np.ptp(picture, axis=-1) < 0.02) & (picture[..., 0] < 0.95)).mean()
+    assert 0.001 < orange < 0.3
+    assert grey > 0.1
 
 
 def test_never_onto_itself_and_nothing_half_written(scene, tmp_path, capsys):
