@@ -115,8 +115,12 @@ def record(path: Path, options: Options, rows: list[dict[str, Any]]) -> None:
     kept = json.loads(path.read_text(encoding="utf-8"))["rows"] if path.is_file() else []
     kept = [row for row in kept if row.get("model", options.name) != options.name]
     half = " --half" if options.half else ""
+    seeds = " ".join(map(str, options.rooms))
     command = f"python benchmarks/ship.py {options.checkpoint.name} {options.name}{half} --kept {options.kept:g}"
-    write_results(path, build_results([*kept, *rows], command=command, seeds=options.rooms))
+    rows = [row | {"command": f"{command} --rooms {seeds}", "kept": options.kept} for row in rows]
+    results = build_results([*kept, *rows], command="python benchmarks/ship.py MODEL NAME (see each row)",
+                            seeds=options.rooms)  # fmt: skip
+    write_results(path, results)
 
 
 def main() -> None:

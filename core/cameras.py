@@ -166,8 +166,8 @@ class Cameras:
         front = depth > 0
         safe = np.where(front, depth, 1.0)
         x, y = local[:, 0] / safe, -local[:, 1] / safe
-        radii = {bend.tobytes(): largest_radius(bend) for bend in np.unique(self.distortion, axis=0)}
-        radius = np.array([radii[bend.tobytes()] for bend in self.distortion])[indices]
+        lenses, which = np.unique(self.distortion, axis=0, return_inverse=True)
+        radius = np.array([largest_radius(bend) for bend in lenses])[which.reshape(-1)][indices]
         front &= x * x + y * y < radius**2
         x, y = np.where(front, x, 0.0), np.where(front, y, 0.0)
         u, v = distort(x, y, self.distortion[indices].T)

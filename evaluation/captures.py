@@ -104,7 +104,8 @@ def load_capture(folder: str | Path, *, downscale: float = 8, normalize: bool = 
             Nerfbusters naming (``frame_00001`` is train, ``frame_1_00001`` eval), else no sweep.
         downscale: how many stored pixels make one, along each axis (>= 1). The size is rounded to whole
             pixels and the intrinsics follow, so 756 / 8 becomes 94 with fy 0.5 % smaller.
-        normalize: as nerfstudio: the mean camera origin goes to 0 and the farthest coordinate of any
+        normalize: as nerfstudio with ``--orientation-method none`` (its own default turns the scene first, and the
+            farthest coordinate depends on that): the mean camera origin goes to 0 and the farthest coordinate of any
             origin, over *all* frames of the file, to +-1. Unlike nerfstudio nothing is rotated "up".
 
     Raises:
@@ -151,12 +152,11 @@ def load_cameras(path: str | Path) -> Cameras:
     meta = _read_json(file)
     frames, names, poses = _posed(meta, file)
     merged = [{**meta, **frame} for frame in frames]
-    sizes = [(body.get("w"), body.get("h")) for body in merged]
-    if len(set(sizes)) > 1 or not all(isinstance(side, (int, float)) and side >= 1 for side in sizes[0]):
-        raise ValueError(
-            f"load_cameras: {file} must state one w and h in pixels for all frames, got {sorted(set(sizes), key=str)}"
-        )
-    width, height = (int(side) for side in sizes[0] if side)
+    sizes = {f"{body.get('w')} x {body.get('h')}" for body in merged}
+    stated: list[Any] = [merged[0].get("w"), merged[0].get("h")]
+    if len(sizes) > 1 or not all(isinstance(side, (int, float)) and 1 <= side < np.inf for side in stated):
+        raise ValueError(f"load_cameras: {file} must state one w and h in pixels for all frames, got {sorted(sizes)}")
+    width, height = (int(side) for side in stated)
     lenses = [_lens(body, name, width, height) for body, name in zip(merged, names)]
     lens, bend = (np.stack(values) for values in zip(*lenses))
     return Cameras.create(poses, lens, width, height, bend)

@@ -210,6 +210,7 @@ def write_splat_ply(
     fields = [(name, splats.rows.dtype[name]) for name in names]
     if keep_score is not None:
         fields.append((KEEP_SCORE, np.dtype("<f4")))
+    target.parent.mkdir(parents=True, exist_ok=True)
     partial = target.with_name(target.name + ".partial")
     chosen = np.flatnonzero(keep)
     try:

@@ -71,7 +71,8 @@ class Trainer:
                 extend(start.network, network)
             else:
                 raise ValueError(f"Trainer: init_from {config.init_from} has another network: {start.network.config}")
-            kept = ("seed", "steps", "seconds", "batch_size", "learning_rate", "commit", "shards", "started_from")
+            kept = ("seed", "steps", "seconds", "batch_size", "learning_rate", "commit", "shards", "started_from",
+                    "drop_channels", "keep_weight")  # fmt: skip
             digest = hashlib.sha256(Path(config.init_from).read_bytes()).hexdigest()
             earlier = {key: value for key, value in start.manifest.training.items() if key in kept}
             self.started_from = {"name": start.manifest.name, "sha256": digest, **earlier}

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ..core.cameras import Cameras, distort, largest_radius, undistort
 from ..core.cube_views import BORDER_POINTS
 
+MOST_TANGENTIAL = 0.05  # of p1, p2: beyond, a lens may fold where its radial terms do not tell
 COARSEST, LEVELS = 8, 3  # cells along an axis at first, and how often: up to 32
 CHUNK = 4096  # cells looked at together
 SLACK = 1e-5  # of the distances involved: float32 rounds
@@ -49,7 +50,7 @@ def _bent_rectangles(plain: FloatArray, bend: FloatArray, along: FloatArray) -> 
         u, v = undistort(x, y, bend)
         missed = np.abs(np.stack(distort(u, v, bend)) - np.stack([x, y])).max()
         radius = np.sqrt((u * u + v * v).max())
-    if not (missed < 1e-6 and radius < 0.999 * largest_radius(bend)):
+    if not (missed < 1e-6 and np.abs(bend[4:]).max() <= MOST_TANGENTIAL and radius < 0.999 * largest_radius(bend)):
         return np.full(4, np.nan), np.array([-np.inf, np.inf, -np.inf, np.inf])
     sides = np.stack([u[0], u[1], v[2], v[3]])
     margin = np.abs(np.diff(sides, n=2, axis=1)).max(axis=1) + 1e-6  # between two samples the border bends no further

@@ -37,7 +37,7 @@ def clean(
     denoiser: str = "default",
     strength: float = 0.5,
     resolution: int | None = None,
-    reach: float = 2.0,
+    reach: float | None = None,
     threads: Threads = 0,
 ) -> None:
     """Clean a density grid (.npz: density (X, Y, Z) per scene unit, aabb (2, 3), cubic cells) or 3D Gaussians (.ply).
@@ -54,19 +54,26 @@ def clean(
         denoiser: a shipped name or an .onnx file.
         strength: 0 removes nothing, 0.5 what the denoiser advises, 1 everything.
         resolution: of splats, cells along the longest side of the box; by the splats' sizes if not given.
-        reach: of splats, how many times the scene's core (98 % of the opacity) is cleaned; what is beyond stays.
+        reach: of splats, how many times the scene's core (98 % of the opacity) is cleaned (twice if not given); what
+            is beyond stays.
         threads: of onnxruntime; 0 leaves the choice to it.
     """
     from .denoisers import load_denoiser
     from .evaluation.captures import load_cameras
 
+    splats = source.suffix == ".ply"
+    target = None if preview else out or source.with_name(f"{source.stem}-clean{source.suffix}")
+    keep = None if preview else keep or source.with_name(f"{source.stem}-keep.npz")
+    _check_distinct(source=source, out=target, keep=keep, preview=preview)
+    if not splats and (resolution is not None or reach is not None):
+        raise ValueError(f"clean: --resolution and --reach are for splats (.ply); {source.name} has its own cells")
     options: dict[str, Any] = {
         "denoiser": load_denoiser(denoiser, backend="onnx", threads=threads or None), "strength": strength,
         "cameras": None if cameras is None else load_cameras(cameras), "progress": _windows(),
     }  # fmt: skip
-    target = None if preview else out or source.with_name(f"{source.stem}-clean{source.suffix}")
-    if source.suffix == ".ply":
-        mask, density_fn = _clean_splats(source, target, resolution=resolution, reach=reach, **options)
+    if splats:
+        options |= {} if reach is None else {"reach": reach}
+        mask, density_fn = _clean_splats(source, target, resolution=resolution, **options)
     else:
         mask, density_fn = _clean_grid(source, target, **options)
     if preview:
@@ -75,12 +82,21 @@ def clean(
         write_preview(preview, mask, density_fn)
         print(f"{region_table(mask)}\nlook at {preview}; nothing was changed")
         return
-    keep = keep or source.with_name(f"{source.stem}-keep.npz")
+    assert keep is not None
     keep.parent.mkdir(parents=True, exist_ok=True)
     mask.save(keep)
     summary = mask.summary()
     print(f"removed {summary['removed']} of {summary['occupied']} occupied cells ({summary['removed_share']:.1%})")
     print(f"cleaned: {target}\nkeep mask: {keep}")
+
+
+def _check_distinct(**files: Path | None) -> None:
+    """No file is written over another: neither over the one to clean nor over what is written beside it."""
+    named = [(name, path.resolve()) for name, path in files.items() if path is not None]
+    for index, (name, path) in enumerate(named):
+        for other, same in named[:index]:
+            if path == same or (path.exists() and same.exists() and path.samefile(same)):
+                raise ValueError(f"clean: {name} and {other} are the same file, {path.name}; write to another")
 
 
 def _clean_grid(source: Path, target: Path | None, **options: Any) -> tuple[KeepMask, Callable[[Any], Any]]:

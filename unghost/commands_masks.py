@@ -46,7 +46,8 @@ def masks(
         min_views: training views that must see a pixel's point.
         downscale: photo pixels per pixel of the depth maps, along each axis.
         depth_along: what the depth is measured along: the pixel's ray, or the camera's optical axis.
-        normalize: the depth is in units in which the farthest camera coordinate is 1 (nerfstudio's), not the file's.
+        normalize: the depth is in units in which the farthest camera coordinate is 1, not the file's: nerfstudio's
+            units if its dataparser does not turn the scene (--orientation-method none).
     """
     import numpy as np
     from PIL import Image

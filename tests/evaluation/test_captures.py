@@ -70,6 +70,8 @@ def test_cameras_need_no_photos_and_are_those_of_the_capture(tmp_path):
     [
         ({}, ("w",), "must state one w and h"),
         ({"h": 0}, (), "must state one w and h"),
+        ({"w": [16]}, (), "must state one w and h"),
+        ({"w": math.inf}, (), "must state one w and h"),
         ({"frames": []}, (), "has no frames"),
         ({}, ("fl_x",), "neither fl_x nor camera_angle_x"),
     ],
@@ -82,7 +84,7 @@ def test_cameras_that_a_file_does_not_tell(meta, drop, message, tmp_path):
 
 def test_cameras_of_two_sizes_are_refused(tmp_path):
     frames = [{"file_path": f"{i}.png", "transform_matrix": pose, "w": 16 + i} for i, pose in enumerate(POSES)]
-    with pytest.raises(ValueError, match=r"one w and h .*\(16, 12\), \(17, 12\)"):
+    with pytest.raises(ValueError, match=r"one w and h .*'16 x 12', '17 x 12'"):
         load_cameras(_write(tmp_path / "c", meta={"frames": frames}))
 
 

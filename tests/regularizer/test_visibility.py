@@ -5,7 +5,7 @@ import pytest
 
 from unghost.core.cameras import Cameras
 from unghost.core.frames import random_rotations
-from unghost.regularizer.view_grid import OPEN, ViewGrid
+from unghost.regularizer.view_grid import OPEN, ViewGrid, image_rectangles
 from unghost.regularizer.visibility import (
     ViewCounter,
     camera_sphere,
@@ -73,6 +73,22 @@ def test_single_pairs_are_seen_as_whole_cameras_see():
     wanted = [bool(rig.project(camera, point)[2]) for camera, point in zip(index, points)]
     assert rig.sees(index, points).tolist() == wanted
     assert 20 < sum(wanted) < 480
+
+
+def test_zeros_of_both_signs_are_one_lens():
+    plain = cameras(2)
+    bend = np.zeros((2, 6))
+    bend[1, 0] = -0.0
+    rig = Cameras.create(plain.camera_to_world, plain.intrinsics, plain.width, plain.height, bend)
+    assert rig.sees(np.array([0, 1]), np.zeros((2, 3))).shape == (2,)
+
+
+def test_a_lens_that_may_fold_is_left_to_the_exact_test():
+    plain = cameras(2)
+    wild = np.array([-0.34, 0.223, -0.0207, -0.0572, 0.2349, 0.0234])
+    sure, possible = image_rectangles(Cameras.create(plain.camera_to_world, plain.intrinsics, 400, 300, wild))
+    assert np.isnan(sure).all()
+    assert np.isinf(possible).all()
 
 
 def test_counter_is_quick():

@@ -113,6 +113,30 @@ def test_a_preview_shows_and_changes_nothing(scene, tmp_path, capsys):
     assert grey > 0.1
 
 
+def test_no_file_is_written_over_another(scene, tmp_path, capsys):
+    from unghost.grids import save_grid
+
+    save_grid(tmp_path / "g.npz", np.ones((4, 4, 4), np.float32), np.array([[0.0, 0, 0], [1, 1, 1]]))
+    (tmp_path / "s.ply").write_bytes(scene.read_bytes())
+    (tmp_path / "link.npz").symlink_to(tmp_path / "g.npz")
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    for words in (
+        ["g.npz", "-o", "g.npz"], ["g.npz", "--keep", "g.npz"], ["s.ply", "--keep", "s.ply"], ["s.ply", "-o", "s.ply"],
+        ["g.npz", "-o", "g-keep.npz"], ["g.npz", "--preview", "g.npz"], ["g.npz", "-o", "link.npz"],
+    ):  # fmt: skip
+        assert cli.main(["clean", *(str(tmp_path / w) if not w.startswith("-") else w for w in words)]) == 2, words
+        assert "are the same file" in capsys.readouterr().err
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+    for option in (["--resolution", "64"], ["--reach", "3"]):
+        assert cli.main(["clean", str(tmp_path / "g.npz"), *option]) == 2
+        assert "are for splats" in capsys.readouterr().err
+
+
+def test_folders_are_made(scene, tmp_path):
+    found = clean_ply(scene, tmp_path / "new" / "clean.ply", denoiser=Constant(1.0), resolution=16)
+    assert len(read_splat_ply(tmp_path / "new" / "clean.ply")) == found.keep.sum()
+
+
 def test_never_onto_itself_and_nothing_half_written(scene, tmp_path, capsys):
     with pytest.raises(ValueError, match="is the file to clean; write to another"):
         clean_ply(scene, scene)
