@@ -6,6 +6,7 @@ OpenGL camera-to-world (+X right, +Y up, looking along -Z), pixel centres at +0.
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +16,8 @@ from numpy.typing import NDArray
 from .arrays import is_tensor, to_numpy
 
 FloatArray = NDArray[np.float64]
+
+FEW_CAMERAS, FEW_POINTS = 48, 6  # looked at, and along each axis of a box, where a glance is enough
 
 
 def distort(x: FloatArray, y: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -196,3 +199,30 @@ class Cameras:
                 visible &= depth <= depth_maps[index][row, column] * (1.0 + tolerance)
             counts += visible
         return counts
+
+
+def warn_if_turned_away(cameras: Cameras | None, aabb: FloatArray, *, caller: str) -> None:
+    """Warn if the cameras see next to nothing of a box, and would see it if their y and z axes were turned round.
+
+    OpenCV's poses (+Y down, looking along +Z) given as OpenGL's look exactly away from what they photographed. Cameras
+    that look outwards from the middle see as much either way: of them nothing can be said.
+
+    Args:
+        cameras: None for nothing to say.
+        aabb: ``(2, 3)``, where the scene is.
+        caller: for the text.
+    """
+    if cameras is None or len(cameras) == 0:
+        return
+    some = cameras.select(np.unique(np.linspace(0, len(cameras) - 1, FEW_CAMERAS).round().astype(int)))
+    along = (np.arange(FEW_POINTS) + 0.5) / FEW_POINTS
+    lattice = aabb[0] + np.stack(np.meshgrid(along, along, along, indexing="ij"), axis=-1) * (aabb[1] - aabb[0])
+    turned = some.camera_to_world * np.array([1.0, -1.0, -1.0, 1.0])
+    other = Cameras(turned, some.intrinsics, some.width, some.height, some.distortion)
+    here, there = (float(rig.view_count(lattice).mean()) / len(some) for rig in (some, other))
+    if here < 0.1 * there and there > 0.02:
+        warnings.warn(
+            f"{caller}: the cameras have {here:.1%} of the aabb in view, and would have {there:.1%} with their y and z "
+            "axes turned round: poses must be OpenGL's (+Y up, looking along -Z), not OpenCV's",
+            stacklevel=3,
+        )

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..core.aabb import as_aabb, scene_extent
-from ..core.cameras import Cameras
+from ..core.cameras import Cameras, warn_if_turned_away
 from ..core.manifest import Denoiser
 from ..core.occupancy import EMPTY, OccupancyRule, check_density
 from ..core.schedule import check_timestep
@@ -157,6 +157,7 @@ def clean(
     s = dataclasses.replace(settings or CleanSettings(), **overrides)
     box = as_aabb(aabb, caller="clean")
     check_denoiser(denoiser, caller="clean")
+    warn_if_turned_away(cameras, box, caller="clean")
     pitch, shape = grid_of(box, s)
     query = make_query(density_fn, place=box.mean(axis=0), backend=s.backend, chunk=s.chunk, caller="clean")
     survey = _survey(query, box, pitch, shape, s)

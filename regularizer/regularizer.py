@@ -18,7 +18,7 @@ except ImportError as error:  # pragma: no cover - exercised in a subprocess
 
 from ..core.aabb import as_aabb, scene_extent
 from ..core.arrays import to_numpy
-from ..core.cameras import Cameras
+from ..core.cameras import Cameras, warn_if_turned_away
 from ..core.manifest import Denoiser
 from ..core.occupancy import DECISION, EMPTY, check_density, check_density_shape, opacity_from_density
 from ..core.schedule import check_timestep
@@ -105,6 +105,7 @@ class DensityRegularizer:
         self.grid = ImportanceGrid(self.aabb, resolution=s.grid_resolution, decay=s.grid_decay)
         self._views: ViewCounter | None = None
         if cameras is not None and len(cameras):
+            warn_if_turned_away(cameras, self.aabb, caller="DensityRegularizer")
             reach = grow_box(self.aabb, s.visibility_reach)
             self._views = ViewCounter(cameras, min_views=s.min_views, aabb=reach)
         self._viewing = viewing_cameras(cameras, denoiser.manifest.channels)

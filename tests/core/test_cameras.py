@@ -1,10 +1,13 @@
+import warnings
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from unghost.core.cameras import Cameras, distort, largest_radius, undistort
+from unghost.core.cameras import Cameras, distort, largest_radius, undistort, warn_if_turned_away
 from unghost.core.frames import random_rotations
+from unghost.fields.scenes import look_at
 
 PHONE = np.array([0.05, -0.08, 0.01, 0.002, 0.0006, -0.0004])
 
@@ -106,3 +109,27 @@ def test_select_keeps_the_axis():
 def test_impossible_cameras_are_refused(pose, lens, words):
     with pytest.raises(ValueError, match=words):
         Cameras.create(pose, np.array(lens, dtype=float), 4, 4)
+
+
+def inward(count=12, radius=2.0):
+    """A ring of cameras that look at the origin; and the same poses as OpenCV writes them."""
+    angle = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    origins = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(count, 0.5)], axis=1)
+    poses = look_at(origins, np.zeros((count, 3)))
+    lens = np.array([60.0, 60, 40, 30])
+    return Cameras.create(poses, lens, 80, 60), Cameras.create(poses * [1, -1, -1, 1], lens, 80, 60)
+
+
+def test_opencv_poses_are_noticed_and_others_are_not():
+    box = np.array([[-0.6] * 3, [0.6] * 3])
+    right, wrong = inward()
+    outward = Cameras.create(look_at(np.zeros((8, 3)) + 0.01, right.origins[:8]), right.intrinsics[0], 80, 60)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_if_turned_away(right, box, caller="me")
+        warn_if_turned_away(outward, box, caller="me")
+        warn_if_turned_away(None, box, caller="me")
+        warn_if_turned_away(right.select(slice(0, 0)), box, caller="me")
+        warn_if_turned_away(wrong, box + 100.0, caller="me")  # a box that nobody looks at, however turned
+    with pytest.warns(UserWarning, match=r"me: the cameras have 0.0% of the aabb in view.*OpenCV"):
+        warn_if_turned_away(wrong, box, caller="me")
