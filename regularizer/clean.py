@@ -151,6 +151,62 @@ def clean(
         >>> mask = clean(density_fn, aabb, denoiser=denoiser, field_pitch=0.02)  # doctest: +SKIP
         >>> cleaned_fn = mask.apply(density_fn)  # doctest: +SKIP
     """
+    return judge(
+        density_fn, aabb, denoiser=denoiser, cameras=cameras, settings=settings, progress=progress, **overrides
+    ).mask()
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """A field, scored: masks of any strength follow without asking the field or the denoiser again.
+
+    Attributes:
+        aabb: ``(2, 3)`` scene units.
+        pitch: of the cells.
+        score: ``(X, Y, Z)`` in [-1, 1], the mean prediction for each cell.
+        settings: see :class:`CleanSettings`.
+        advised: the denoiser's own threshold.
+    """
+
+    aabb: NDArray[np.float64]
+    pitch: float
+    score: NDArray[np.float32]
+    settings: CleanSettings
+    advised: float
+    _survey: _Survey
+    _about: dict[str, Any]
+
+    def mask(self, strength: float | None = None) -> KeepMask:
+        """The mask at a strength in [0, 1]; None for that of the settings."""
+        s = self.settings if strength is None else dataclasses.replace(self.settings, strength=strength)
+        survey, shape = self._survey, self.score.shape
+        threshold = threshold_of(s.strength, self.advised)
+        removed, faint = decide(
+            survey.occupied, survey.judged, self.score,
+            threshold=threshold, smallest=s.smallest, speck=s.speck, fringe=s.fringe,
+        ) if s.strength > 0 else (np.zeros(shape, bool), np.zeros(shape, bool))  # fmt: skip
+        removed, faint = removed & ~survey.protected, faint & ~survey.protected
+        origin = lattice_origin(self.aabb, self.pitch, shape)
+        regions, region_count = removed_regions(removed, self.score, origin, self.pitch)
+        details = {
+            "occupied": int(survey.occupied.sum()), "removed": int(removed.sum()), "faint_removed": int(faint.sum()),
+            "dropped": survey.dropped, "threshold": threshold, **self._about,
+            "settings": dataclasses.asdict(s), "region_count": region_count, "regions": regions,
+        }  # fmt: skip
+        return KeepMask(self.aabb, self.pitch, ~(removed | faint), details)
+
+
+def judge(
+    density_fn: Callable[[Any], Any],
+    aabb: ArrayLike,
+    *,
+    denoiser: Denoiser,
+    cameras: Cameras | None = None,
+    settings: CleanSettings | None = None,
+    progress: Progress | None = None,
+    **overrides: Any,
+) -> Judgement:
+    """The costly part of :func:`clean`, with its arguments: survey the field, score its cells."""
     known = {item.name for item in dataclasses.fields(CleanSettings)}
     if set(overrides) - known:
         raise TypeError(f"clean: unknown settings {sorted(set(overrides) - known)}; known are {sorted(known)}")
@@ -163,19 +219,8 @@ def clean(
     survey = _survey(query, box, pitch, shape, s)
     maps = light_maps(denoiser.manifest.channels, cameras, query, aabb=box, pitch=s.field_pitch or pitch)
     score, windows = _score(survey, denoiser, s, box, pitch, cameras, maps, progress)
-    threshold = threshold_of(s.strength, denoiser.manifest.removal_threshold)
-    removed, faint = decide(
-        survey.occupied, survey.judged, score,
-        threshold=threshold, smallest=s.smallest, speck=s.speck, fringe=s.fringe,
-    ) if s.strength > 0 else (np.zeros(shape, bool), np.zeros(shape, bool))  # fmt: skip
-    removed, faint = removed & ~survey.protected, faint & ~survey.protected
-    regions, region_count = removed_regions(removed, score, lattice_origin(box, pitch, shape), pitch)
-    details = {
-        "occupied": int(survey.occupied.sum()), "removed": int(removed.sum()), "faint_removed": int(faint.sum()),
-        "dropped": survey.dropped, "windows": windows, "threshold": threshold, "denoiser": denoiser.manifest.name,
-        "settings": dataclasses.asdict(s), "region_count": region_count, "regions": regions,
-    }  # fmt: skip
-    return KeepMask(box, pitch, ~(removed | faint), details)
+    about = {"windows": windows, "denoiser": denoiser.manifest.name}
+    return Judgement(box, pitch, score, s, denoiser.manifest.removal_threshold, survey, about)
 
 
 def grid_of(aabb: NDArray[np.float64], settings: CleanSettings) -> tuple[float, tuple[int, int, int]]:
