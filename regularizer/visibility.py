@@ -92,12 +92,22 @@ class ViewCounter:
         cameras: fixed.
         min_views: where counting stops, >= 1.
         aabb: ``(2, 3)``, where most points will be; None for no cells.
+        depth_maps: ``(cameras, height, width)`` depth along the optical axis, inf for nothing: a point that something
+            hides from a camera is not seen by it.
+        tolerance: relative, of that comparison.
     """
 
-    def __init__(self, cameras: Cameras, *, min_views: int = 1, aabb: ArrayLike | None = None) -> None:
+    def __init__(
+        self, cameras: Cameras, *, min_views: int = 1, aabb: ArrayLike | None = None,
+        depth_maps: NDArray[Any] | None = None, tolerance: float = 0.05,
+    ) -> None:  # fmt: skip
         if min_views < 1:
             raise ValueError(f"ViewCounter: min_views must be >= 1, got {min_views}")
-        self.min_views = int(min_views)
+        shape = (len(cameras), cameras.height, cameras.width)
+        if depth_maps is not None and np.shape(depth_maps) != shape:
+            raise ValueError(f"ViewCounter: depth_maps must have shape {shape}, got {np.shape(depth_maps)}")
+        self.min_views, self.tolerance = int(min_views), tolerance
+        self._depth = None if depth_maps is None else np.asarray(depth_maps)
         box = None if aabb is None else as_aabb(aabb, caller="ViewCounter")
         self._grid = None if box is None else ViewGrid(cameras, box, min_views=self.min_views)
         self._single = [cameras.select(index) for index in range(len(cameras))]
@@ -112,12 +122,13 @@ class ViewCounter:
         open_ = np.arange(len(points))
         if self._grid is not None:
             counts = self._grid.count(points)
-            open_ = np.flatnonzero(counts == OPEN)
+            open_ = np.flatnonzero(counts == OPEN if self._depth is None else counts != 0)
             counts[open_] = 0
         for index in np.argsort(-self._settled, kind="stable"):
             if open_.size == 0:
                 break
-            seen = self._single[index].view_count(points[open_])
+            depth = None if self._depth is None else self._depth[index : index + 1]
+            seen = self._single[index].view_count(points[open_], depth_maps=depth, tolerance=self.tolerance)
             self._settled[index] += seen.mean()
             counts[open_] += seen
             open_ = open_[counts[open_] < self.min_views]

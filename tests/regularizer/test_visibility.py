@@ -75,6 +75,21 @@ def test_single_pairs_are_seen_as_whole_cameras_see():
     assert 20 < sum(wanted) < 480
 
 
+@pytest.mark.parametrize("boxed", [False, True])
+def test_what_something_hides_is_not_seen(boxed):
+    rig = cameras(6)
+    rng = np.random.default_rng(3)
+    depth = rng.uniform(0.2, 2.0, (6, rig.height, rig.width))
+    depth[rng.random(depth.shape) < 0.2] = np.inf
+    points = rng.uniform(BOX[0], BOX[1], (3000, 3))
+    counter = ViewCounter(rig, min_views=2, aabb=BOX if boxed else None, depth_maps=depth, tolerance=0.1)
+    full = rig.view_count(points, depth_maps=depth, tolerance=0.1)
+    np.testing.assert_array_equal(np.minimum(counter(points), 2), np.minimum(full, 2))
+    assert (full < rig.view_count(points)).mean() > 0.1
+    with pytest.raises(ValueError, match=r"depth_maps must have shape \(6, 300, 400\), got \(5, 300, 400\)"):
+        ViewCounter(rig, depth_maps=depth[:5])
+
+
 def test_zeros_of_both_signs_are_one_lens():
     plain = cameras(2)
     bend = np.zeros((2, 6))
