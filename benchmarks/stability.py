@@ -21,6 +21,7 @@ from unghost.core.occupancy import OccupancyRule
 from unghost.regularizer.clean import clean
 from unghost.regularizer.losses import dsds_loss, stable_mean
 from unghost.regularizer.regularizer import DensityRegularizer
+from unghost.regularizer.rivals import free_space_loss, sparsity_loss, squash_density, total_variation_loss
 from unghost.regularizer.visibility import ViewCounter
 
 BOX = np.array([[-1.0] * 3, [1.0] * 3])
@@ -193,6 +194,23 @@ def huge_sum() -> float:
     return relative(loss, LARGEST)
 
 
+def squash(how: Any) -> Callable[[torch.Tensor], torch.Tensor]:
+    return lambda density: squash_density(density, threshold=0.01, how=how)
+
+
+def rival(loss: Callable[[torch.Tensor], torch.Tensor], largest: float = LARGEST) -> float:
+    """Densities of all magnitudes in float32 against float64; gradients are finite."""
+    magnitudes = [0.0, 1e-45, 1e-30, 1e-3, 1.0, 30.0, 1e10, largest]
+    generator = np.random.default_rng(0)
+    single = torch.from_numpy(generator.choice(magnitudes, (6, 6, 6)).astype(np.float32)).requires_grad_()
+    double = single.detach().double().requires_grad_()
+    found, exact = loss(single), loss(double)
+    stable_mean(found).backward()
+    assert torch.isfinite(single.grad).all()
+    difference = (found.detach().double() - exact.detach()).abs()
+    return float((difference / exact.detach().abs().clamp(min=torch.finfo(torch.float32).tiny)).max())
+
+
 @dataclass(frozen=True)
 class Case:
     """One row: what goes in, what happens, and the check, which may return a relative error."""
@@ -236,6 +254,13 @@ CASES = [
     Case("t = 0", FINITE, lambda: timestep(0)),
     Case("t = 999", FINITE, lambda: timestep(999)),
     Case("a batch of 0: no cubes, no points", "exactly 0", nothing),
+    Case("total variation, densities 0 to 3.4e38", "finite, in float64; gradient 0 where nothing changes",
+         lambda: rival(total_variation_loss)),
+    Case("sparsity, densities 0 to 3.4e38", "between 0 and 1; small densities keep their digits (`expm1`)",
+         lambda: rival(lambda d: sparsity_loss(d, length=0.05))),
+    Case("free-space prior, densities 0 to 3.4e38", "between 1/2 and 1", lambda: rival(free_space_loss)),
+    Case("densities squashed by a clamp", "between −1 and 1", lambda: rival(squash("clamp"))),
+    Case("densities squashed by a sigmoid", "between −1 and 1.005", lambda: rival(squash("sigmoid"))),
 ]  # fmt: skip
 
 HEAD = ("| input | behaviour | relative error against float64 |", "|---|---|---|")
