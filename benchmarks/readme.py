@@ -138,7 +138,7 @@ def channels(results: dict[str, Any]) -> list[str]:
         "How many training photos have a voxel in their frustum (views) helps most; the largest share of light that "
         "one of them gets from it through the field itself (transmittance) helps on scenes like those trained on and "
         "on the capture, not on another kind of field; the surroundings (the same centre, three times the edge) add "
-        "little. The shipped prior sees the opacity alone.",
+        "little. The shipped prior takes opacity and views.",
     ]  # fmt: skip
 
 

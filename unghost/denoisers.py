@@ -61,7 +61,7 @@ def load_denoiser(
     Example:
         >>> denoiser = load_denoiser()  # doctest: +SKIP
         >>> denoiser.manifest.channels  # doctest: +SKIP
-        ('signed_opacity',)
+        ('signed_opacity', 'view_count')
     """
     if backend is not None and backend not in _LOADERS:
         raise ValueError(f"load_denoiser: backend must be one of {sorted(_LOADERS)}, got {backend!r}")

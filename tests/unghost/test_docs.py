@@ -24,7 +24,9 @@ def test_every_key_of_the_formats_is_documented():
     assert [word for word in words if not re.search(rf"[`\"]{re.escape(word)}[`\"]", FORMATS)] == []
 
 
-@pytest.mark.parametrize("name", ["README.md", "CHANGELOG.md", "docs/conventions.md", "docs/formats.md", "docs/prior.md"])
+@pytest.mark.parametrize(
+    "name", ["README.md", "CHANGELOG.md", "docs/conventions.md", "docs/formats.md", "docs/prior.md"]
+)
 def test_links_between_documents_lead_somewhere(name):
     path = ROOT / name
     for target in re.findall(r"\]\(([^)#]+)\)", path.read_text(encoding="utf-8")):
