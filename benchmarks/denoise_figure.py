@@ -40,7 +40,9 @@ def draw(path: Path, rows: Sequence[dict[str, Any]]) -> None:
     from matplotlib import pyplot as plt
 
     speeds = {row["method"]: row["cubes_per_second"] for row in rows if "cubes_per_second" in row}
-    models = {row["method"]: row.get("model") for row in rows}
+    models = dict.fromkeys((row["method"] for row in rows), None) | {
+        row["method"]: row["model"] for row in rows if "model" in row
+    }
     names = list(dict.fromkeys(row["method"] for row in rows))
     figure, axes = plt.subplots(1, len(PANELS), figsize=(17, 5.2), constrained_layout=True)
     for axis, (name, key, heading) in zip(axes, PANELS):
@@ -68,5 +70,8 @@ def draw(path: Path, rows: Sequence[dict[str, Any]]) -> None:
         axis.set_xlabel("cubes a second, two threads")
         if timed:
             axis.set_xscale("log")
+            axis.xaxis.set_major_formatter("{x:.0f}")
+            axis.xaxis.set_minor_formatter("{x:.0f}")
+            axis.margins(x=0.15)
     figure.savefig(path, dpi=90)
     plt.close(figure)

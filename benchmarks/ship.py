@@ -113,7 +113,7 @@ def written(options: Options, folder: Path, threshold: float) -> dict[str, Path]
 def record(path: Path, options: Options, rows: list[dict[str, Any]]) -> None:
     """The rows into threshold.json, in the place of those of an earlier model of that name."""
     kept = json.loads(path.read_text(encoding="utf-8"))["rows"] if path.is_file() else []
-    kept = [row for row in kept if row.get("model", options.name) != options.name]
+    kept = [row for row in kept if row.get("model", "default") != options.name]
     half = " --half" if options.half else ""
     seeds = " ".join(map(str, options.rooms))
     command = f"python benchmarks/ship.py {options.checkpoint.name} {options.name}{half} --kept {options.kept:g}"

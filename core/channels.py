@@ -25,6 +25,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from .arrays import Array, namespace
 from .frames import RESOLUTION, cube_lattices
 from .occupancy import EMPTY, OCCUPIED
 from .shards import MAX_VIEW_COUNT, SURROUNDINGS_EDGE, SURROUNDINGS_RESOLUTION
@@ -134,6 +135,20 @@ def stack_channels(names: Sequence[str], signed: NDArray[np.floating], known: Ma
             values = known[name]
             stacked[:, index] = full_channel(values) if values.shape[1:] != signed.shape[1:] else values
     return stacked
+
+
+def with_unknown(channels: Array, count: int) -> Array:
+    """Cubes of which only the first channel is given ``(N, 1, R, R, R)`` with ``count - 1`` unknown ones behind it.
+
+    Args:
+        channels: array or tensor; of any other number of channels it is returned as it is.
+        count: channels that a denoiser takes.
+    """
+    if count == 1 or len(channels.shape) != 5 or channels.shape[1] != 1:
+        return channels
+    xp, shape = namespace(channels), (channels.shape[0], count - 1, *channels.shape[2:])
+    unknown = xp.full_like(channels[:, :1], UNKNOWN)
+    return xp.concatenate([channels, xp.broadcast_to(unknown, shape)], 1)
 
 
 def surroundings_lattice(

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.channels import with_unknown
 from ..core.frames import RESOLUTION
 from ..core.manifest import Manifest
 from ..core.schedule import check_timestep
@@ -109,7 +110,8 @@ class OnnxDenoiser:
         """Denoise.
 
         Args:
-            channels: ``(N, C, 32, 32, 32)`` float32 in [-1, 1]; N may be 0.
+            channels: ``(N, C, 32, 32, 32)`` float32 in [-1, 1]; N may be 0. Given ``(N, 1, 32, 32, 32)``, the other
+                channels are unknown.
             timestep: ``(N,)`` integers in [0, 1000), or one for all.
             edge_fraction: ``(N,)`` finite and > 0, or one for all: edge length over the scene's extent.
 
@@ -123,6 +125,7 @@ class OnnxDenoiser:
         if not isinstance(channels, np.ndarray) or channels.dtype != np.float32:
             found = getattr(channels, "dtype", type(channels).__name__)
             raise TypeError(f"OnnxDenoiser: channels must be a float32 numpy array, got {found}")
+        channels = with_unknown(channels, len(self.manifest.channels))
         cube = (len(self.manifest.channels), RESOLUTION, RESOLUTION, RESOLUTION)
         if channels.shape[1:] != cube or channels.ndim != 5:
             raise ValueError(f"OnnxDenoiser: channels must have shape (N, {str(cube)[1:]}, got {channels.shape}")

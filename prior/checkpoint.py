@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..core.channels import with_unknown
 from ..core.manifest import METADATA_KEY, Manifest
 from ..core.schedule import TIMESTEPS
 from .networks import AnyNetwork, build_network, config_from_dict
@@ -88,7 +89,7 @@ class TorchDenoiser:
         """Denoise.
 
         Args:
-            channels: ``(N, C, 32, 32, 32)`` in [-1, 1].
+            channels: ``(N, C, 32, 32, 32)`` in [-1, 1]; given ``(N, 1, 32, 32, 32)``, the others are unknown.
             timestep: ``(N,)`` integers in [0, 1000), or one for all.
             edge_fraction: ``(N,)`` > 0, or one for all.
 
@@ -100,6 +101,7 @@ class TorchDenoiser:
             ValueError: shapes, or values out of range.
         """
         device = next(self.network.parameters()).device
+        channels = with_unknown(channels, len(self.manifest.channels))
         count = (len(channels),)
         times = torch.as_tensor(timestep, device=device)
         if times.is_floating_point() or times.dtype == torch.bool:

@@ -44,7 +44,8 @@ def load_denoiser(
     """Load the shipped denoiser, or one of your own.
 
     Args:
-        name_or_path: a shipped name (``"default"``), or the path of an ``.onnx`` or ``.safetensors`` file.
+        name_or_path: a shipped name (``"default"``; ``"views"``, which takes view counts too), or the path of an
+            ``.onnx`` or ``.safetensors`` file.
         backend: ``"onnx"`` (numpy arrays in and out; no torch) or ``"torch"`` (tensors). None takes what
             the file's ending says, and ``"onnx"`` for a shipped name.
         threads: of onnxruntime; None leaves the choice to it.
@@ -61,7 +62,7 @@ def load_denoiser(
     Example:
         >>> denoiser = load_denoiser()  # doctest: +SKIP
         >>> denoiser.manifest.channels  # doctest: +SKIP
-        ('signed_opacity', 'view_count')
+        ('signed_opacity',)
     """
     if backend is not None and backend not in _LOADERS:
         raise ValueError(f"load_denoiser: backend must be one of {sorted(_LOADERS)}, got {backend!r}")

@@ -48,6 +48,19 @@ def test_the_shipped_denoiser_by_both_engines():
 
 
 @needs_weights
+def test_what_is_not_given_is_unknown():
+    import torch
+
+    light, full = load_denoiser("views", threads=1), load_denoiser("views", backend="torch")
+    assert light.manifest.channels == full.manifest.channels == ("signed_opacity", "view_count")
+    cubes = np.random.default_rng(0).uniform(-1, 1, (2, 1, 32, 32, 32)).astype(np.float32)
+    told = np.concatenate([cubes, np.full_like(cubes, -1.0)], axis=1)
+    np.testing.assert_array_equal(light(told, 900, 0.1), light(cubes, 900, 0.1))
+    np.testing.assert_array_equal(full(torch.from_numpy(told), 900, 0.1), full(torch.from_numpy(cubes), 900, 0.1))
+    np.testing.assert_allclose(light(cubes, 900, 0.1), full(torch.from_numpy(cubes), 900, 0.1), atol=1e-4)
+
+
+@needs_weights
 def test_the_shipped_files_are_small():
     for suffix in (".onnx", ".safetensors"):
         assert (WEIGHTS / f"default{suffix}").stat().st_size <= 4_000_000
