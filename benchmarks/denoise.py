@@ -187,7 +187,7 @@ def measure(options: Options) -> dict[str, Any]:
             rows += [row_of(f"{name}, blind", denoiser, blind(cubes), denoiser.manifest.default_timestep) | about
                      for cubes in sets if tells_more(cubes)]  # fmt: skip
         if name in files:
-            rows.append(speed_row(Model.of(name, files[name], WEIGHTS), options.threads, **about))
+            rows.append(speed_row(Model.of(name, files[name], WEIGHTS), options.threads) | about)
         results = build_results(
             rows, command=options.command(), seeds=[SEED], priors=priors, severities=list(SEVERITIES)
         )
