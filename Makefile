@@ -11,14 +11,19 @@ MADE := $(VENV)/.made
 INPUTS := pyproject.toml constraints.txt
 SYSTEM_PACKAGES := libusb-1.0-0 libgl1 libegl1 libgomp1 libx11-6
 
+NERFSTUDIO := .venv-nerfstudio
+NERFSTUDIO_NEEDS := 'viser==0.2.7' 'tyro<0.10' tensorboard 'protobuf<=3.20.3' torchmetrics jaxtyping \
+	opencv-python-headless matplotlib splines rich msgpack safetensors tqdm onnxruntime pyyaml
+
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check clean clean-all demo-setup
+.PHONY: help setup demo test check clean clean-all demo-setup nerfstudio
 
 help:
 	@echo "make demo       clean a synthetic room with labelled ghosts; writes out/demo/index.html (no torch)"
 	@echo "make test       set up everything, then run the whole test suite"
 	@echo "make setup      create .venv with every extra, pinned by constraints.txt"
 	@echo "make check      ruff, formatting, mypy"
+	@echo "make nerfstudio nerfacto with the regularizer on, for some steps, in .venv-nerfstudio"
 	@echo "make clean      remove caches and builds"
 	@echo "make clean-all  the same, and .venv"
 	@echo "PYTHON=python3.12 make …  to choose the interpreter (3.10 or later)"
@@ -70,9 +75,22 @@ check: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# nerfstudio 1.1.5 pins an old protobuf and much that its models do without: an environment of its own, no dependencies.
+$(NERFSTUDIO)/.made:
+	@echo "setting up $(NERFSTUDIO) with nerfstudio 1.1.5 …"
+	@$(PYTHON) -m venv $(NERFSTUDIO)
+	@$(NERFSTUDIO)/bin/pip install --quiet torch==2.13.0 numpy setuptools wheel
+	@$(NERFSTUDIO)/bin/pip install --quiet --no-deps nerfstudio==1.1.5 nerfacc==0.5.2
+	@$(NERFSTUDIO)/bin/pip install --quiet $(NERFSTUDIO_NEEDS)
+	@$(NERFSTUDIO)/bin/pip install --quiet --no-deps --no-build-isolation -e .
+	@touch $@
+
+nerfstudio: $(NERFSTUDIO)/.made
+	$(NERFSTUDIO)/bin/python -W ignore benchmarks/nerfstudio_client.py $(ARGUMENTS)
+
 clean:
 	rm -rf build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
 	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +
 
 clean-all: clean
-	rm -rf $(VENV)
+	rm -rf $(VENV) $(NERFSTUDIO)
