@@ -39,7 +39,7 @@ def demo(results: dict[str, Any]) -> list[str]:
     return ["**The demo's room** (`make demo`; every ghost labelled):", "", *table(head, rows), "", said]
 
 
-SHIPPED = "unghost"  # as the reference measurement calls it
+SHIPPED = ("unghost", "views")  # as the reference measurement calls the default and the other
 FOG = {
     "harvest": "fields of scenes not trained on",
     "harvest-unseen-field": "a kind of field not trained on",
@@ -50,7 +50,7 @@ FOG = {
 def denoise(results: dict[str, Any]) -> list[str]:
     rows = results["rows"]
     speeds = {row["method"]: row for row in rows if "cubes_per_second" in row}
-    smaller = tuple(name for name, row in speeds.items() if row["precision"] != "fp32")  # in the table of models
+    smaller = tuple(name for name in speeds if name.endswith(("-fp16", "-int8")))  # in the table of models
     shown = [name for name in dict.fromkeys(row["method"] for row in rows if row["set"] != "speed")
              if "@" not in name and not name.startswith(smaller or ("\n",))]  # fmt: skip
     methods = [name for name in shown if any(row["method"] == name and row["set"] == "clean" for row in rows)]
@@ -75,9 +75,9 @@ def denoise(results: dict[str, Any]) -> list[str]:
             "threshold for all cubes of a set:", "",
             *table(["method", *(FOG[name] for name in foggy)], lines), "",
             *(f"{line}\n" for line in (_beaten(found, name, shown) for name in foggy) if line),
-            f"`{SHIPPED}` is the shipped prior; blind, it is told nothing but the opacity. The diffusions are compact "
-            "ones after a short training ([the prior](docs/prior.md)), shown at timestep 50; at 10, 100 and 200 they "
-            "are in docs/results/denoise.json.", "",
+            "`unghost` is the default, `views` the other shipped prior; blind, it is told nothing but the opacity. "
+            "The diffusions are compact ones after short training ([the prior](docs/prior.md)), shown at timestep 50; "
+            "at 10 and 100 they are in docs/results/denoise.json.", "",
         ]  # fmt: skip
     speed = next(iter(speeds.values()))
     bare = [f"{name} {row['cubes_per_second']:.1f}" for name, row in speeds.items() if not row.get("trained", True)]
@@ -115,15 +115,13 @@ def _model(row: Row, found: dict[Any, Row]) -> list[str]:
 
 
 def _beaten(found: dict[Any, Row], name: str, shown: list[str]) -> str:
-    """A sentence if the shipped prior is not the best on a set of fog."""
+    """A sentence if neither of the shipped priors is the best on a set of fog."""
     scores = {key[0]: row["ghosts_removed_98"] for key, row in found.items() if key[1] == name and key[0] in shown}
     best = max(scores, key=lambda method: scores[method])
-    if best == SHIPPED:
+    if best in SHIPPED:
         return ""
-    return (
-        f"On {FOG[name]} the shipped prior **loses** to {best} at .98 kept "
-        f"({scores[SHIPPED]:.3f} against {scores[best]:.3f})."
-    )
+    mine = max(SHIPPED, key=lambda method: scores.get(method, -1.0))
+    return f"On {FOG[name]} {mine} **loses** to {best} at .98 kept ({scores[mine]:.3f} against {scores[best]:.3f})."
 
 
 def _removed(row: Row) -> str:
