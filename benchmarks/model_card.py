@@ -104,28 +104,22 @@ def told(stage: dict[str, Any]) -> str:
     )
 
 
-def chosen_row(name: str) -> dict[str, Any]:
-    """Of threshold.json: what made the model's threshold what it is."""
-    (row,) = [row for row in load("threshold")["rows"] if row.get("model") == name and row["chosen"]]
-    return dict(row)
-
-
 def section(name: str, path: Path, manifest: Manifest) -> list[str]:
     """The card of one model."""
-    training = manifest.training
+    training, chosen = manifest.training, load(f"threshold_{name}")
     files = [
         [file.name, f"{file.stat().st_size / 1e6:.2f} MB", f"`{hashlib.sha256(file.read_bytes()).hexdigest()}`"]
         for file in (path, path.with_suffix(".safetensors"))
     ]
     folder = run_folder(manifest, len(stages(training)) - 1)
-    command = chosen_row(name)["command"].replace("ship.py ", f"ship.py {folder}/")
+    command = chosen["command"].replace("ship.py ", f"ship.py {folder}/")
     half = " Its weights are stored in half precision." if precision_of(manifest) == "fp16" else ""
     return [
         f"`{manifest.name}`, size {size_of(manifest).upper()}: {manifest.parameters} parameters, "
         f"{training['gflop']:.2f} GFLOP a cube. It sees {', '.join(manifest.channels)}.{half} Default timestep "
         f"{manifest.default_timestep}; removal threshold {manifest.removal_threshold:.2f}, for `clean`: the largest of "
-        f"those tried at which it keeps {chosen_row(name)['kept']:g} of the surface of rooms made for that "
-        "(docs/results/threshold.json). DSDS decides at 0 unless told otherwise.", "",
+        f"those tried at which it keeps {chosen['kept']:g} of the surface of rooms made for that "
+        f"(docs/results/threshold_{name}.json). DSDS decides at 0 unless told otherwise.", "",
         *table(("file", "size", "sha256"), files), "",
         f"From random weights: {' and then '.join(map(told, stages(training)))}, on two CPU cores "
         f"({training['precision']}), torch {training['torch']}. In harvested cubes, voxels that are opaque and true "

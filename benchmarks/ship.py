@@ -8,13 +8,12 @@ largest one that keeps the wanted share of the surface, mean over the rooms, goe
 thresholds of single cubes differ from it: `clean` has the last word on pieces, pores and skirts of surfaces. No
 cameras are told, so a model that takes view counts does without them here.
 
-Writes NAME.safetensors and NAME.onnx among the weights, and the candidates' scores into ``threshold.json``.
+Writes NAME.safetensors and NAME.onnx among the weights, and the candidates' scores into ``threshold_NAME.json``.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import json
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,7 +46,7 @@ class Options:
         half: store the weights in half precision; the model computes in float32 all the same.
         rooms: seeds of the rooms.
         kept: share of the surface that must stay.
-        out: where threshold.json goes.
+        out: where threshold_NAME.json goes.
         weights: where the shipped models are.
     """
 
@@ -72,7 +71,7 @@ class _Advising:
         return self._denoiser(channels, timestep, edge_fraction)
 
 
-def row_of(name: str, denoiser: Any, threshold: float, rooms: tuple[int, ...]) -> dict[str, Any]:
+def row_of(denoiser: Any, threshold: float, rooms: tuple[int, ...]) -> dict[str, Any]:
     """Mean scores of ``clean`` at ``threshold``."""
     advised = _Advising(denoiser, threshold)
     found = []
@@ -82,14 +81,14 @@ def row_of(name: str, denoiser: Any, threshold: float, rooms: tuple[int, ...]) -
         found.append(score(room, np.asarray(mask.keep(cell_centers(AABB, SHAPE)))))
     keys = ("floater_recall", "floater_precision", "surface_kept", "iou_before", "iou")
     means = {key: float(np.mean([scores[key] for scores in found])) for key in keys}
-    return {"method": f"clean, {name}", "model": name, "threshold": threshold, **means}
+    return {"method": "clean", "threshold": threshold, **means}
 
 
-def choose(name: str, denoiser: Any, options: Options) -> tuple[float, list[dict[str, Any]]]:
+def choose(denoiser: Any, options: Options) -> tuple[float, list[dict[str, Any]]]:
     """The threshold, and a row for each candidate up to the first that keeps too little."""
     rows: list[dict[str, Any]] = []
     for threshold in CANDIDATES:
-        rows.append(row_of(name, denoiser, threshold, options.rooms))
+        rows.append(row_of(denoiser, threshold, options.rooms))
         print(" ".join(f"{k}={v:.3f}" if isinstance(v, float) else v for k, v in rows[-1].items()), flush=True)
         if rows[-1]["surface_kept"] < options.kept:
             break
@@ -110,27 +109,22 @@ def written(options: Options, folder: Path, threshold: float) -> dict[str, Path]
     return {".safetensors": checkpoint, ".onnx": exported}
 
 
-def record(path: Path, options: Options, rows: list[dict[str, Any]]) -> None:
-    """The rows into threshold.json, in the place of those of an earlier model of that name."""
-    kept = json.loads(path.read_text(encoding="utf-8"))["rows"] if path.is_file() else []
-    kept = [row for row in kept if row.get("model", "default") != options.name]
-    half = " --half" if options.half else ""
-    seeds = " ".join(map(str, options.rooms))
+def record(options: Options, rows: list[dict[str, Any]]) -> None:
+    """The candidates and their scores, one file a model."""
+    rooms, half = " ".join(map(str, options.rooms)), " --half" if options.half else ""
     command = f"python benchmarks/ship.py {options.checkpoint.name} {options.name}{half} --kept {options.kept:g}"
-    rows = [row | {"command": f"{command} --rooms {seeds}", "kept": options.kept} for row in rows]
-    results = build_results([*kept, *rows], command="python benchmarks/ship.py MODEL NAME (see each row)",
-                            seeds=options.rooms)  # fmt: skip
-    write_results(path, results)
+    results = build_results(rows, command=f"{command} --rooms {rooms}", seeds=options.rooms, kept=options.kept)
+    write_results(options.out / f"threshold_{options.name}.json", results)
 
 
 def main() -> None:
     options = tyro.cli(Options, description=__doc__)
     with tempfile.TemporaryDirectory() as scratch:
-        threshold, rows = choose(options.name, load_denoiser(written(options, Path(scratch), 0.0)[".onnx"]), options)
+        threshold, rows = choose(load_denoiser(written(options, Path(scratch), 0.0)[".onnx"]), options)
         for suffix, path in written(options, Path(scratch), threshold).items():
             (options.weights / f"{options.name}{suffix}").write_bytes(path.read_bytes())
     rows = [row | {"chosen": row["threshold"] == threshold} for row in rows]
-    record(options.out / "threshold.json", options, rows)
+    record(options, rows)
     print(f"{options.name}: threshold {threshold:g}")
 
 

@@ -37,21 +37,21 @@ def options(ship, tmp_path):
 def kept_until(threshold):
     """``row_of`` of a model that keeps enough up to some threshold."""
 
-    def row_of(name, denoiser, candidate, rooms):
+    def row_of(denoiser, candidate, rooms):
         kept = 0.99 if candidate <= threshold + 1e-9 else 0.9
-        return {"method": f"clean, {name}", "model": name, "threshold": candidate, "surface_kept": kept}
+        return {"method": "clean", "threshold": candidate, "surface_kept": kept}
 
     return row_of
 
 
 def test_the_largest_threshold_that_keeps_enough(ship, options, monkeypatch):
     monkeypatch.setattr(ship, "row_of", kept_until(0.2))
-    chosen, rows = ship.choose("mine", None, options)
+    chosen, rows = ship.choose(None, options)
     assert chosen == 0.2
     assert rows[-1]["threshold"] == 0.3  # and no further
     monkeypatch.setattr(ship, "row_of", kept_until(-2.0))
     with pytest.raises(SystemExit, match="nothing is written"):
-        ship.choose("mine", None, options)
+        ship.choose(None, options)
 
 
 @pytest.mark.parametrize("half", [False, True])
@@ -67,14 +67,5 @@ def test_the_files_hold_the_threshold_and_agree(ship, options, half, monkeypatch
     cubes = np.random.default_rng(0).uniform(-1, 1, (2, 1, 32, 32, 32)).astype(np.float32)
     difference = np.abs(onnx(cubes, 900, 0.1) - torch_model(torch.from_numpy(cubes), 900, 0.1).numpy()).max()
     assert difference < 1e-5  # the very same weights, halved or not
-    rows = json.loads((tmp_path / "threshold.json").read_text(encoding="utf-8"))["rows"]
+    rows = json.loads((tmp_path / "threshold_mine.json").read_text(encoding="utf-8"))["rows"]
     assert [row["threshold"] for row in rows if row["chosen"]] == [0.1]
-
-
-def test_rows_of_other_models_stay(ship, options, tmp_path):
-    path = tmp_path / "threshold.json"
-    for name, value in (("mine", 1), ("other", 2), ("mine", 3)):
-        named = ship.Options(options.checkpoint, name)
-        ship.record(path, named, [{"method": "clean", "model": name, "value": value}])
-    rows = json.loads(path.read_text(encoding="utf-8"))["rows"]
-    assert [(row["model"], row["value"]) for row in rows] == [("other", 2), ("mine", 3)]
