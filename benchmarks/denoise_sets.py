@@ -13,17 +13,26 @@ import numpy as np
 from capture_cubes import capture_shards, cubes_folder
 from numpy.typing import NDArray
 
-from unghost.core.occupancy import FREE_LABEL, SURFACE_LABEL, signed_from_occupancy
+from unghost.core.occupancy import (
+    FREE_LABEL,
+    SURFACE_LABEL,
+    opacity_from_density,
+    signed_from_occupancy,
+    signed_from_opacity,
+)
 from unghost.core.packing import dequantize_signed, unpack_labels
 from unghost.core.shards import Shard, read_shard
 from unghost.data_recipes.augment import CORRUPTIONS, corrupt
+from unghost.data_recipes.compose import dilate
 from unghost.data_recipes.curate import curate
 from unghost.data_recipes.preview import find_shards
 from unghost.data_recipes.recipe import load_recipe
+from unghost.fields.sdf_density import laplace_density
 
 SEED = 77
 SEVERITIES = (0.1, 0.3, 0.5, 0.8, 1.0)
 MIXED = "mixed"
+BUBBLES = ("bits", "soft")  # the families of the set of that name
 CAPTURE_CUBES = 160  # of each of three fields
 
 
@@ -32,7 +41,8 @@ class CubeSet:
     """Labelled cubes.
 
     Attributes:
-        name: ``clean``, ``synthetic``, ``synthetic-soft``, ``harvest``, ``harvest-unseen-field`` or ``capture``.
+        name: ``clean``, ``bubbles``, ``synthetic``, ``synthetic-soft``, ``harvest``, ``harvest-unseen-field`` or
+            ``capture``.
         about: what tells rows of one set apart: ``family`` and ``severity`` of the corruption.
         signed: ``(N, 32, 32, 32)`` float32 signed opacity.
         labels: ``(N, 32, 32, 32)`` uint8.
@@ -110,8 +120,39 @@ def damaged(clean: CubeSet, family: str, severity: float) -> CubeSet:
     return dataclasses.replace(clean, name="synthetic", about=about, signed=signed.astype(np.float32))
 
 
+def _with_bubbles(rng: np.random.Generator, surface: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """``(R, R, R)`` surface and one to three smooth ellipsoids, radii 2 to 6 voxels, two voxels clear of it."""
+    grid, free = np.indices(surface.shape).transpose(1, 2, 3, 0).astype(float), ~dilate(surface, 2)
+    result, wanted = surface.copy(), int(rng.integers(1, 4))
+    for _ in range(12):  # places tried
+        center, radii = rng.uniform(0, surface.shape[0] - 1, 3), rng.uniform(2.0, 6.0, 3)
+        turned = (grid - center) @ np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        body = ((turned / radii) ** 2).sum(axis=-1) < 1.0
+        if wanted and body.any() and free[body].all():
+            result, wanted = result | body, wanted - 1
+    return result
+
+
+def bubble_sets(clean: CubeSet) -> Iterator[CubeSet]:
+    """What a learned distance grows where no photo looks: closed smooth bodies in free space, beside clean surface.
+
+    As bits, and as the opacity of VolSDF's Laplace density of both (scale .7 of a voxel). Such bodies are no
+    corruption of the recipes, whose blobs are lumpy.
+    """
+    from scipy.ndimage import distance_transform_edt
+
+    surface = clean.labels == SURFACE_LABEL
+    seen = np.stack([_with_bubbles(np.random.default_rng([SEED, 31, row]), cube) for row, cube in enumerate(surface)])
+    bits = signed_from_occupancy(seen).astype(np.float32)
+    distance = np.stack([distance_transform_edt(~cube) - distance_transform_edt(cube) for cube in seen])
+    density = laplace_density(distance.astype(np.float32), beta=0.7)
+    soft = signed_from_opacity(opacity_from_density(density, 1.0))
+    for family, signed in zip(BUBBLES, (bits, soft)):
+        yield dataclasses.replace(clean, name="bubbles", about={"family": family}, signed=signed)
+
+
 def mesh_sets(meshes: Path, count: int, few: int) -> Iterator[CubeSet]:
-    """Cubes of meshes of the ``test`` split: untouched, corrupted as bits, and as soft opacities.
+    """Cubes of meshes of the ``test`` split: untouched, with bubbles, corrupted as bits, and as soft opacities.
 
     Args:
         meshes: folder with a manifest.csv.
@@ -134,6 +175,7 @@ def mesh_sets(meshes: Path, count: int, few: int) -> Iterator[CubeSet]:
     # the truth of an untouched cube is the cube: none of its voxels is left out
     known = dataclasses.replace(clean, labels=np.where(clean.signed > 0, SURFACE_LABEL, FREE_LABEL).astype(np.uint8))
     yield known
+    yield from bubble_sets(known)
     for severity in SEVERITIES:
         yield damaged(known, MIXED, severity)
     for family in CORRUPTIONS:

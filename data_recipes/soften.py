@@ -14,7 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.occupancy import opacity_from_density, signed_from_occupancy, signed_from_opacity
+from .draws import log_uniform
 
+ALIKE = 1 / 3  # of the soft cubes: ghosts as sharp and as opaque as the surface
 Grid = NDArray[np.float32]
 Matrix = NDArray[np.float32]
 
@@ -103,8 +105,9 @@ def soften(
     """Signed opacity of a smooth field whose bits would be about ``corrupted``.
 
     What ``clean`` and ``corrupted`` share is a true surface: blurred by 0.3 to 1.5 voxels, of opacity 0.3 to
-    0.99. What ``corrupted`` adds is ghost: blurred by 0.3 to 2.5 voxels, of opacity 0.05 to 0.97, varying
-    smoothly in space. Fog volumes are added, the density is multiplied by smooth noise, and all of it passes
+    0.99. What ``corrupted`` adds is ghost: in a third of the cubes blurred and opaque as the surface is (or would
+    be), so that neither gives it away, else blurred by 0.3 to 2.5 voxels and of opacity 0.05 to 0.97; its density
+    varies smoothly in space. Fog volumes are added, the density is multiplied by smooth noise, and all of it passes
     through ``1 - exp(-density * voxel)``. Blur, fog and noise fade in with severity; at 0 the result is
     ``corrupted`` as bits.
 
@@ -128,12 +131,13 @@ def soften(
     resolution, fade = clean.shape[0], min(1.0, 4.0 * severity)
     surface, ghost = clean & corrupted, corrupted & ~clean
     depth: Any = np.zeros(clean.shape, dtype=np.float32)
+    peak, width = 1.0 - fade * log_uniform(rng, 0.01, 0.7), fade * rng.uniform(0.3, 1.5)
     if surface.any():
-        peak = 1.0 - fade * float(np.exp(rng.uniform(np.log(0.01), np.log(0.7))))
-        depth = depth + _spread(rng, surface, fade * rng.uniform(0.3, 1.5), peak)
+        depth = depth + _spread(rng, surface, width, peak)
     if ghost.any():
-        peak = float(np.exp(rng.uniform(np.log(0.05), np.log(0.97))))
-        ghosts = _spread(rng, ghost, fade * rng.uniform(0.3, 2.5), peak)
+        if rng.random() >= ALIKE:
+            peak, width = log_uniform(rng, 0.05, 0.97), fade * rng.uniform(0.3, 2.5)
+        ghosts = _spread(rng, ghost, width, peak)
         uneven = np.exp(np.float32(rng.uniform(0, 1.0)) * coarse_noise(rng, int(rng.integers(2, 8)), resolution))
         depth = depth + ghosts * uneven
     if rng.random() < 0.75:

@@ -3,7 +3,7 @@ import pytest
 
 from unghost.core.frames import unit_lattice
 from unghost.core.occupancy import opacity_from_signed
-from unghost.data_recipes.augment import corrupt, fog_volumes
+from unghost.data_recipes.augment import corrupt, detached_blobs, fog_volumes
 from unghost.data_recipes.soften import _blurring, _regridding, coarse_noise, soften
 
 SHELL = np.abs(np.linalg.norm(unit_lattice(), axis=-1) - 0.3) < 0.05
@@ -48,6 +48,16 @@ def test_true_surfaces_stay_visible_and_ghosts_are_often_faint():
     assert np.quantile(ghosts, 0.2) < 0.3 < np.quantile(ghosts, 0.9)
     # neither is separable by a threshold alone: some ghosts are denser than some surfaces
     assert max(ghosts) > min(surfaces)
+
+
+def test_opacity_does_not_tell_a_ghost_from_a_surface():
+    """In a fair share of the cubes the ghosts are at least as opaque as a typical surface."""
+    opaque = []
+    for seed in range(150):
+        noisy = detached_blobs(np.random.default_rng(seed), SHELL, 0.7)
+        opacity = opacity_from_signed(soften(np.random.default_rng(seed), SHELL, noisy, 0.7))
+        opaque.append(np.median(opacity[noisy & ~SHELL]) > 0.9 * np.median(opacity[SHELL]))
+    assert 0.25 < np.mean(opaque) < 0.75
 
 
 def test_empty_and_full_cubes():

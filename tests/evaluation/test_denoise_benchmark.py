@@ -276,3 +276,25 @@ def test_pseudo_truth_goes_by_the_votes_of_the_photos(parts):
     labels = truth.labels(places, 0.02, opaque, dark)
     assert truth.labels(places, 0.02, opaque, ~dark)[2] == IGNORE_LABEL
     assert labels.tolist() == [FREE_LABEL, SURFACE_LABEL, SURFACE_LABEL, IGNORE_LABEL, IGNORE_LABEL, IGNORE_LABEL]
+
+
+def test_bubbles_are_whole_ghosts_clear_of_the_surface(parts):
+    from scipy.ndimage import binary_dilation, label
+
+    truth = np.stack([plate(), np.ones((32, 32, 32), bool)])
+    clean = parts["sets"].CubeSet(
+        "clean", {}, signed(truth), np.where(truth, SURFACE_LABEL, FREE_LABEL).astype(np.uint8),
+        np.full(2, 0.1, np.float32), np.arange(2, dtype=np.int32),
+    )  # fmt: skip
+    bits, soft = parts["sets"].bubble_sets(clean)
+    bubbles = (bits.signed > 0) & ~truth
+    assert 1 <= label(bubbles[0])[1] <= 3
+    assert bubbles[0].sum() > 30
+    assert not (binary_dilation(truth[0], np.ones((3, 3, 3)), 2) & bubbles[0]).any()
+    assert not bubbles[1].any()  # no room
+    assert (bits.signed[truth] == 1).all()
+    # half way into a body of several voxels, nearly opaque; far from all, nearly clear
+    assert soft.signed[0, 10, 10, 15] > 0
+    assert soft.signed[0, 0, 0, 0] < -0.9
+    again = next(parts["sets"].bubble_sets(clean))
+    np.testing.assert_array_equal(bits.signed, again.signed)
