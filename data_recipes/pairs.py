@@ -95,7 +95,7 @@ def damage(
     severity = float(low + (high - low) * rng.random() ** recipe.severity_exponent)
     if rng.random() >= recipe.soft_share:
         return signed_from_occupancy(corrupt(rng, clean, severity)), _labels(clean), severity
-    clean = dilate(clean, recipe.soft_dilation)
+    clean = dilate(clean, int(rng.integers(recipe.soft_dilation + 1)))
     signed = soften(rng, clean, corrupt(rng, clean, severity), severity)
     labels = _labels(clean)
     labels[dilate(clean, SOFT_SKIRT) & ~clean] = IGNORE_LABEL

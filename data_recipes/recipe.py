@@ -56,8 +56,8 @@ class Recipe:
         shell_thickness: uniform, 1 marks the voxels that the surface crosses.
         max_dilation: 0 to this many dilations by one voxel, lower counts likelier.
         soft_share: the input is a soft opacity instead of bits.
-        soft_dilation: further dilations of the clean cube of soft pairs: a field spreads a surface over
-            several voxels, and a label thinner than that would teach a network to delete it.
+        soft_dilation: 0 to this many further dilations of the clean cube of soft pairs: many a field spreads a
+            surface over several voxels, and a label thinner than that would teach a network to delete it.
         clean_share: the input is the clean cube (severity 0).
         severity: range of the severity of all others, within [0, 1].
         severity_exponent: severity is ``low + (high - low) * u ** exponent``.
