@@ -48,7 +48,7 @@ class TrainConfig:
         default_timestep: of the manifest; None for 900, or 50 for a diffusion (the paper's range is 10 to 50).
         threshold_from: validation shards, joined by commas; the mean of their thresholds at .98 of the surface kept
             goes to the manifest; "" for 0.
-        init_from: checkpoint (``model.safetensors``) to start from, or ""; it may see fewer channels.
+        init_from: checkpoint (``model.safetensors``) to start from, or ""; it may see other channels.
     """
 
     name: str = "unghost-restoration"

@@ -18,7 +18,7 @@ from .diffusion_network import DiffusionNet
 from .diffusion_training import diffusion_losses
 from .distributed import Group
 from .ema import ExponentialMovingAverage
-from .extend import can_extend, extend
+from .rewire import can_rewire, rewire
 from .networks import AnyNetwork, build_network, network_for
 from .objective import restoration_loss
 
@@ -67,8 +67,8 @@ class Trainer:
             start = load_model(config.init_from)
             if start.network.config == network.config:
                 network.load_state_dict(start.network.state_dict())
-            elif can_extend(start.network, network):
-                extend(start.network, network)
+            elif can_rewire(start.network, network):
+                rewire(start.network, network)
             else:
                 raise ValueError(f"Trainer: init_from {config.init_from} has another network: {start.network.config}")
             kept = ("seed", "steps", "seconds", "batch_size", "learning_rate", "commit", "shards", "started_from",
