@@ -26,7 +26,9 @@ def rewire(old: nn.Module, new: nn.Module) -> None:
     """Give ``new`` the weights of ``old``; whatever joins channels that ``old`` does not know to the rest is zero.
 
     Channels that ``new`` does without are unknown for good: what a cube full of that adds moves into the bias of the
-    first convolution, which is exact but for the outermost two voxels. What the branch for the surroundings computes stays as it was drawn: only the way out of it starts at zero, so that
+    first convolution, which is exact but for the outermost two voxels.
+
+    What the branch for the surroundings computes stays as it was drawn: only the way out of it starts at zero, so that
     it learns from the first step.
 
     Args:

@@ -18,9 +18,9 @@ from .diffusion_network import DiffusionNet
 from .diffusion_training import diffusion_losses
 from .distributed import Group
 from .ema import ExponentialMovingAverage
-from .rewire import can_rewire, rewire
 from .networks import AnyNetwork, build_network, network_for
 from .objective import restoration_loss
+from .rewire import can_rewire, rewire
 
 
 class TrainingDiverged(RuntimeError):
