@@ -32,7 +32,7 @@ def rewire(old: nn.Module, new: nn.Module) -> None:
     it learns from the first step.
 
     Args:
-        old: sees some of the channels of ``new``, in any order.
+        old: with other channels, in any order.
         new: changed in place.
 
     Raises:
@@ -40,9 +40,7 @@ def rewire(old: nn.Module, new: nn.Module) -> None:
     """
     if not (isinstance(old, RestorationNet) and isinstance(new, RestorationNet) and can_rewire(old, new)):
         told = [getattr(network, "config", type(network).__name__) for network in (old, new)]
-        raise ValueError(
-            f"rewire: {told[1]} is not {told[0]} with other channels, surroundings among them if they were"
-        )
+        raise ValueError(f"rewire: {told[1]} is not {told[0]} with other channels (surroundings must stay)")
     given, state = old.state_dict(), new.state_dict()
     for name, value in state.items():
         if name == "stem.weight":
