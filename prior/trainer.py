@@ -75,7 +75,8 @@ class Trainer:
                     "drop_channels", "keep_weight")  # fmt: skip
             digest = hashlib.sha256(Path(config.init_from).read_bytes()).hexdigest()
             earlier = {key: value for key, value in start.manifest.training.items() if key in kept}
-            self.started_from = {"name": start.manifest.name, "sha256": digest, **earlier}
+            seen = list(start.manifest.channels)
+            self.started_from = {"name": start.manifest.name, "sha256": digest, "channels": seen, **earlier}
         self.network: AnyNetwork = network.to(self.device).to(memory_format=torch.channels_last_3d)  # type: ignore[call-overload]
         self.optimizer = _optimizer(self.network, config)
         self.average = ExponentialMovingAverage(self.network, decay=config.ema_decay)

@@ -91,6 +91,7 @@ def test_a_run_starts_from_a_model_of_one_channel(tiny_config, tmp_path):
     seeing = dataclasses.replace(config.network, channels=("signed_opacity", "transmittance"))
     trainer = Trainer(dataclasses.replace(config, network=seeing, init_from=str(tmp_path / "start.safetensors")))
     assert trainer.started_from["name"] == "start"
+    assert trainer.started_from["channels"] == ["signed_opacity"]
     channels = torch.rand(2, 2, 32, 32, 32) * 2 - 1
     torch.testing.assert_close(
         ask(trainer.network.eval(), channels), ask(start.eval(), channels[:, :1]), rtol=1e-5, atol=1e-5
