@@ -40,7 +40,7 @@ from unghost.regularizer.regularizer import DensityRegularizer
 from unghost.regularizer.settings import RegularizerSettings
 
 ROOT = Path(__file__).resolve().parents[1]
-METHODS = {"field": "(a) fine-tuned alone", "visibility": "(b) + visibility", "dsds": "(c) + visibility + DSDS"}
+WITHOUT_PRIOR = {"field": "(a) fine-tuned alone", "visibility": "(b) + visibility"}
 FIGURE_VIEWS = 4
 Views = dict[str, NDArray[Any]]
 
@@ -61,7 +61,8 @@ class Options:
         resolution: density nodes of the field along an axis (.8 of it for colour); the field's defaults if left out.
         depth_limit: farther predicted depths do not count; twice the widest camera distance if left out (the
             paper's words; the value in its code is 2).
-        denoiser: a shipped name or the path of an .onnx or .safetensors file.
+        denoisers: for (c), each a shipped name or the path of an .onnx or .safetensors file; the first one's row is
+            ``dsds``, the others' ``dsds, NAME``.
         settings: of the regularizer, as name=value, e.g. dsds_weight=0.2 cubes=20.
         out: where capture.json and capture.png go.
         cache: where fitted fields and renderings are kept; remove it to start over.
@@ -77,7 +78,7 @@ class Options:
     finetune_steps: int = 300
     resolution: int | None = None
     depth_limit: float | None = None
-    denoiser: str = "default"
+    denoisers: tuple[str, ...] = ("default",)
     settings: tuple[str, ...] = ()
     out: Path = ROOT / "docs" / "results"
     cache: Path = ROOT / "out" / "capture"
@@ -90,8 +91,17 @@ class Options:
         parts += [f"--seconds {self.seconds:g}" if self.steps is None else f"--steps {self.steps}"]
         parts += [f"--resolution {self.resolution}"] if self.resolution else []
         parts += [f"--depth-limit {self.depth_limit:g}"] if self.depth_limit else []
-        parts += [f"--denoiser {Path(self.denoiser).name}"] if self.denoiser != "default" else []
+        named = " ".join(Path(name).name for name in self.denoisers)
+        parts += [f"--denoisers {named}"] if self.denoisers != ("default",) else []
         return " ".join([*parts, *(["--settings", *self.settings] if self.settings else [])])
+
+    def priors(self) -> dict[str, str]:
+        """Method to denoiser."""
+        return {"dsds" + (f", {Path(name).stem}" if index else ""): name for index, name in enumerate(self.denoisers)}
+
+    def methods(self) -> dict[str, str]:
+        """Row's name to heading."""
+        return WITHOUT_PRIOR | {name: f"(c) + visibility + {name.replace('dsds', 'DSDS')}" for name in self.priors()}
 
     def overrides(self) -> dict[str, Any]:
         """``settings`` as keyword arguments."""
@@ -147,7 +157,7 @@ def fit_field(options: Options, cache: FitCache, name: str, sweep: Sweep, seed: 
 def fine_tune(
     options: Options, base: RadianceField, train: Sweep, evaluation: Sweep, seed: int, method: str, denoiser: Any
 ) -> Views:
-    """Renderings of a copy of ``base`` after fine-tuning it by one of ``METHODS``, and the seconds it took."""
+    """Renderings of a copy of ``base`` after fine-tuning it by one of the methods, and the seconds it took."""
     field = copy.deepcopy(base)
     hooks: dict[str, Any] = {}
     if method != "field":
@@ -166,12 +176,12 @@ def fine_tune(
     return {**render(field, evaluation.cameras), "seconds": np.array(record["seconds"])}
 
 
-def tuning_key(options: Options, method: str, weights: dict[str, str]) -> dict[str, Any]:
+def tuning_key(options: Options, method: str, weights: dict[str, dict[str, str]]) -> dict[str, Any]:
     """What renderings after fine-tuning depend on besides the base field and the cameras."""
     key: dict[str, Any] = {"steps": options.finetune_steps, "code": code_hash(unghost.fields)}
     if method != "field":
         key["regularizer"] = {**options.overrides(), "code": code_hash(unghost.regularizer)}
-    return {**key, "prior": weights} if method == "dsds" else key
+    return {**key, "prior": weights[method]} if method in weights else key
 
 
 def score_seed(
@@ -199,10 +209,13 @@ def run(options: Options) -> dict[str, Any]:
     train, evaluation, both = (
         Sweep(capture.cameras.select(chosen), capture.images(chosen)) for chosen in (*indices, np.concatenate(indices))
     )
-    denoiser = load_denoiser(options.denoiser)
-    weights = {"name": denoiser.manifest.name, "sha256": denoiser.manifest.body_sha256 or file_hash(options.denoiser)}
+    methods, denoisers = options.methods(), {m: load_denoiser(name) for m, name in options.priors().items()}
+    weights = {
+        method: {"name": used.manifest.name, "sha256": used.manifest.body_sha256 or file_hash(options.priors()[method])}
+        for method, used in denoisers.items()
+    }
     cache, shown = FitCache(options.cache), dict[str, Views]()
-    fits, tunes = 1 + len(options.seeds), len(options.seeds) * len(METHODS)
+    fits, tunes = 1 + len(options.seeds), len(options.seeds) * len(methods)
     guess = options.seconds if options.steps is None else options.steps * 0.3
     plan = Plan(["fit"] * fits + ["tune"] * tunes, {"fit": guess, "tune": options.finetune_steps * 0.5})
 
@@ -219,22 +232,23 @@ def run(options: Options) -> dict[str, Any]:
         base, record = fit_field(options, cache, "field", train, seed)
         records.append({"seed": seed, **record})
         tuned = {}
-        for method, heading in METHODS.items():
+        for method, heading in methods.items():
             plan.begin("tune", f"seed {seed}, {heading}")
             key = {"field": record["sha256"], "eval": evaluation.digest(), **tuning_key(options, method, weights)}
-            make = functools.partial(fine_tune, options, base, train, evaluation, seed, method, denoiser)
+            used = denoisers.get(method, denoisers["dsds"])  # without a weight it is not asked
+            make = functools.partial(fine_tune, options, base, train, evaluation, seed, method, used)
             tuned[method] = cache.views(f"{method}-{seed}", key, make)
         shown = tuned if seed == options.seeds[0] else shown
         per_seed.append(score_seed(seed, tuned, evaluation, pseudo_views["depth"], visible, limit))
-    rows = [mean_over_seeds(method, [scores[method] for scores in per_seed]) for method in METHODS]
+    rows = [mean_over_seeds(method, [scores[method] for scores in per_seed]) for method in methods]
     results = build_results(
-        rows, command=options.command(), seeds=options.seeds, capture=capture.folder.resolve().name, prior=weights,
+        rows, command=options.command(), seeds=options.seeds, capture=capture.folder.resolve().name, priors=weights,
         regularizer={k: v for k, v in dataclasses.asdict(RegularizerSettings(**overrides)).items() if k != "seed"},
         depth_limit=limit, visible_share=float(visible.mean()), fields=records, pseudo_ground_truth=pseudo_record,
     )  # fmt: skip
     write_results(options.out / "capture.json", protocol.json_ready(results))
     draw(options, {"photo · pseudo depth": {"rgb": evaluation.photos, "depth": pseudo_views["depth"]},
-                   **{METHODS[method]: views for method, views in shown.items()}}, limit, rows)  # fmt: skip
+                   **{methods[method]: views for method, views in shown.items()}}, limit, rows)  # fmt: skip
     return results
 
 

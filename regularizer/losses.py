@@ -6,10 +6,13 @@ Gradients flow through ``density`` only; what the denoiser predicted enters as a
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 try:
     import torch
     from torch import Tensor
+    from torch.autograd.function import once_differentiable
 except ImportError as error:  # pragma: no cover - exercised in a subprocess
     raise ImportError("unghost.regularizer.losses needs torch: pip install unghost[torch]") from error
 
@@ -122,3 +125,58 @@ def stable_mean(loss: Tensor, *, count: int | None = None) -> Tensor:
     """
     wide = widest(loss)
     return (wide / max(loss.numel() if count is None else count, 1)).sum()
+
+
+def cube_parts(cubes: Tensor) -> list[slice]:
+    """How to go through cubes ``(N, R, R, R)``: on a CPU one by one, so that all steps find one in its cache."""
+    size = 1 if cubes.device.type == "cpu" else max(len(cubes), 1)
+    return [slice(start, start + size) for start in range(0, len(cubes), size)]
+
+
+def cubewise_mean(
+    loss: Callable[[Tensor, Tensor], Tensor], density: Tensor, x0_pred: Tensor, factor: Tensor, used: Tensor
+) -> Tensor:
+    """Mean loss of many cubes in float64, one after the other on a CPU, in whose cache all of them have no room.
+
+    Args:
+        loss: ``(density (n, R, R, R) times factor, x0_pred)`` to the unreduced loss, the same shape.
+        density: ``(N, R, R, R)``.
+        x0_pred: the same shape; not differentiated.
+        factor: ``(N, 1, 1, 1)`` float64, not differentiated.
+        used: ``(N, R, R, R)`` bool: the mean is over these.
+
+    Returns:
+        Scalar float64 (float32 on mps); exactly 0 where nothing is used. It can be differentiated once.
+    """
+    result: Tensor = _CubewiseMean.apply(density, loss, x0_pred, factor, used)  # type: ignore[no-untyped-call]
+    return result
+
+
+class _CubewiseMean(torch.autograd.Function):
+    """See :func:`cubewise_mean`."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, density: Tensor, loss: Callable[[Tensor, Tensor], Tensor], x0_pred: Tensor, factor: Tensor,
+        used: Tensor,
+    ) -> Tensor:  # fmt: skip
+        """The mean; the gradient is worked out on the way."""
+        count, total = max(int(used.sum()), 1), widest(density.new_zeros(()))
+        gradient = torch.empty_like(density) if ctx.needs_input_grad[0] else None
+        for part in cube_parts(density):
+            with torch.enable_grad():
+                wide = widest(density[part].detach()).requires_grad_(gradient is not None)
+                each = loss(wide * factor[part], x0_pred[part])
+                mean = stable_mean(torch.where(used[part], each, torch.zeros_like(each)), count=count)
+            if gradient is not None:
+                gradient[part] = torch.autograd.grad(mean, wide)[0]
+            total = total + mean.detach()
+        ctx.save_for_backward(gradient)
+        return total
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_output: Tensor) -> tuple[Tensor | None, None, None, None, None]:
+        """To the density alone."""
+        (gradient,) = ctx.saved_tensors
+        return (None if gradient is None else gradient * grad_output.to(gradient)), None, None, None, None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
@@ -26,7 +27,7 @@ from .context import viewing_cameras
 from .cube_context import FollowedRays, complete_channels, cube_surroundings
 from .cubes import CubeBatch, FieldPitch, draw_cubes, wide_dtype
 from .denoise import check_denoiser, run_denoiser
-from .losses import dsds_loss, stable_mean, upcast, visibility_loss, widest
+from .losses import cube_parts, cubewise_mean, dsds_loss, stable_mean, upcast, visibility_loss, widest
 from .proposals import ImportanceGrid
 from .queries import field_device
 from .settings import RegularizerSettings
@@ -238,34 +239,31 @@ class DensityRegularizer:
 
     def _dsds_of_field(self, field: DensityFn, cubes: CubeBatch, index: int) -> Tensor:
         """Mean over the voxels in the box, unweighted."""
-        values, valid = self._query(field, cubes.positions[cubes.inside])
-        density = values.new_zeros(cubes.inside.shape).masked_scatter(cubes.inside, values)
-        used = cubes.inside.clone().masked_scatter(cubes.inside, valid)
+        if bool(cubes.inside.all()):  # nearly always: then nothing need be gathered and scattered
+            values, valid = self._query(field, cubes.positions.flatten(0, 3))
+            density, used = values.reshape(cubes.inside.shape), valid.reshape(cubes.inside.shape)
+        else:
+            values, valid = self._query(field, cubes.positions[cubes.inside])
+            density = values.new_zeros(cubes.inside.shape).masked_scatter(cubes.inside, values)
+            used = cubes.inside.clone().masked_scatter(cubes.inside, valid)
         if index == 0:
             self._refresh(*cubes.thinned(density.detach(), used))
         x0_pred = self._predict(density.detach(), cubes, field, index)
-        depth = widest(density) * cubes.pitch if self.settings.rule.kind == "opacity" else density
-        loss = dsds_loss(
-            depth,
-            x0_pred.to(depth),
-            target_density=float(self.settings.rule.density_threshold(1.0)),
-            threshold=self.threshold,
-            fill_threshold=self.fill_threshold,
+        factor = cubes.pitch if self.settings.rule.kind == "opacity" else torch.ones_like(cubes.pitch)
+        target = float(self.settings.rule.density_threshold(1.0))
+        loss = functools.partial(
+            dsds_loss, target_density=target, threshold=self.threshold, fill_threshold=self.fill_threshold
         )
-        return stable_mean(torch.where(used, loss, torch.zeros_like(loss)), count=int(used.sum()))
+        return cubewise_mean(loss, density, x0_pred, factor, used)
 
     def _predict(self, density: Tensor, cubes: CubeBatch, field: DensityFn, index: int) -> Tensor:
         """``x0_pred (N, R, R, R)`` float32; all empty for cubes that were not worth asking about."""
         s = self.settings
-        wide = widest(density)
         x0_pred = torch.full_like(density, EMPTY, dtype=torch.float32)
-        asked = torch.ones(len(density), dtype=torch.bool, device=density.device)
-        if s.skip_empty:
-            asked = s.rule.occupied(wide, cubes.pitch).flatten(1).any(dim=1)
+        asked, channels = self._shown(density, cubes)
         self.report.update(denoised=int(asked.sum()), skipped_empty=int((~asked).sum()))
         if not bool(asked.any()):
             return x0_pred
-        channels = s.rule.encode(wide[asked], cubes.pitch[asked], soft=s.soft).float()[:, None]
         if len(self.denoiser.manifest.channels) > 1:
 
             def ask(places: Tensor) -> Tensor:
@@ -283,6 +281,17 @@ class DensityRegularizer:
             self.denoiser, channels, timestep, cubes.edge_fraction[asked.cpu().numpy()], caller="DensityRegularizer"
         )[:, 0]
         return x0_pred
+
+    def _shown(self, density: Tensor, cubes: CubeBatch) -> tuple[Tensor, Tensor]:
+        """Which cubes are worth asking about, ``(N,)``, and what the denoiser sees of them: ``(n, 1, R, R, R)``."""
+        s, asked, shown = self.settings, [], []
+        for part in cube_parts(density):
+            wide, pitch = widest(density[part]), cubes.pitch[part]
+            asked.append(s.rule.occupied(wide, pitch).flatten(1).any(dim=1) if s.skip_empty
+                         else torch.ones(len(wide), dtype=torch.bool, device=density.device))  # fmt: skip
+            if bool(asked[-1].any()):
+                shown.append(s.rule.encode(wide[asked[-1]], pitch[asked[-1]], soft=s.soft).float())
+        return torch.cat(asked), torch.cat(shown)[:, None] if shown else density[:0, None].float()
 
     def _visibility(self, fields: list[DensityFn], device: torch.device) -> Tensor:
         s = self.settings

@@ -72,7 +72,7 @@ def test_a_run_writes_results_and_a_figure_and_is_resumed_from_its_cache(bench, 
     assert str(tmp_path) not in text  # nobody's paths
     assert [row["method"] for row in results["rows"]] == ["field", "visibility", "dsds"]
     assert results["seeds"] == [0, 1]
-    assert results["prior"] == {"name": "hollow", "sha256": "0" * 64}
+    assert results["priors"] == {"dsds": {"name": "hollow", "sha256": "0" * 64}}
     assert results["regularizer"]["cubes"] == 1
     for row in results["rows"]:
         assert {scores["seed"] for scores in row["per_seed"]} == {0, 1}
@@ -105,12 +105,12 @@ def test_a_run_writes_results_and_a_figure_and_is_resumed_from_its_cache(bench, 
 
 def test_the_cache_knows_what_depends_on_whose_code(bench, capture, tmp_path, monkeypatch):
     options = _options(bench, capture, tmp_path)
-    weights = {"name": "hollow", "sha256": "0"}
-    before = {method: bench.tuning_key(options, method, weights) for method in bench.METHODS}
-    same = {method: bench.tuning_key(options, method, {**weights, "sha256": "1"}) for method in bench.METHODS}
+    weights, others = ({"dsds": {"name": "hollow", "sha256": sha256}} for sha256 in "01")
+    before = {method: bench.tuning_key(options, method, weights) for method in options.methods()}
+    same = {method: bench.tuning_key(options, method, others) for method in options.methods()}
     assert [method for method in before if before[method] == same[method]] == ["field", "visibility"]
     monkeypatch.setattr(bench, "code_hash", lambda package: package.__name__.replace("unghost.fields", "this code"))
-    after = {method: bench.tuning_key(options, method, weights) for method in bench.METHODS}
+    after = {method: bench.tuning_key(options, method, weights) for method in options.methods()}
     assert [method for method in before if before[method] == after[method]] == ["field"]
 
 
@@ -120,6 +120,14 @@ def test_methods_start_from_the_same_field_and_differ(bench, capture, tmp_path):
     rows = {row["method"]: row for row in bench.run(options)["rows"]}
     assert rows["field"]["psnr_visible"] != rows["visibility"]["psnr_visible"]
     assert rows["dsds"]["psnr_visible"] != rows["visibility"]["psnr_visible"]
+
+
+def test_a_row_for_each_prior(bench, capture, tmp_path):
+    options = _options(bench, capture, tmp_path, seeds=(0,), denoisers=("default", "some/views.onnx"))
+    assert "--denoisers default views.onnx" in options.command()
+    results = bench.run(options)
+    assert [row["method"] for row in results["rows"]] == ["field", "visibility", "dsds", "dsds, views"]
+    assert set(results["priors"]) == {"dsds", "dsds, views"}
 
 
 def test_bad_options_are_named_before_anything_is_fitted(bench, capture, tmp_path, monkeypatch):

@@ -1,7 +1,9 @@
+import functools
+
 import pytest
 import torch
 
-from unghost.regularizer.losses import dsds_loss, stable_mean, visibility_loss
+from unghost.regularizer.losses import cubewise_mean, dsds_loss, stable_mean, visibility_loss
 
 
 def test_dsds_by_hand_both_halves_alive():
@@ -98,3 +100,39 @@ def test_errors_name_function_and_argument():
         visibility_loss(density, torch.ones(4), min_views=0)
     with pytest.raises(TypeError, match="floating-point"):
         dsds_loss(torch.ones(4, dtype=torch.int64), density, target_density=1.0)
+
+
+def one_by_one(density, x0_pred, factor, used):
+    each = dsds_loss((density * factor).double(), x0_pred.double(), target_density=0.1, fill_threshold=0.3)
+    return torch.where(used, each, torch.zeros_like(each)).sum() / used.sum()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_mean_cube_by_cube_is_the_mean(dtype):
+    generator = torch.Generator().manual_seed(0)
+    density = torch.rand(3, 4, 4, 4, generator=generator, dtype=dtype).requires_grad_()
+    x0_pred = torch.rand(3, 4, 4, 4, generator=generator) * 2 - 1
+    used = torch.rand(3, 4, 4, 4, generator=generator) > 0.2
+    factor = torch.tensor([0.1, 2.0, 0.01], dtype=torch.float64)[:, None, None, None]
+    loss = functools.partial(dsds_loss, target_density=0.1, fill_threshold=0.3)
+    found = cubewise_mean(loss, density, x0_pred, factor, used)
+    expected = one_by_one(density, x0_pred, factor, used)
+    torch.testing.assert_close(found, expected)
+    gradients = [torch.autograd.grad(3 * value, density)[0] for value in (found, expected)]
+    assert gradients[0].dtype == dtype
+    assert (gradients[1] != 0).any()
+    torch.testing.assert_close(*gradients)
+    assert not cubewise_mean(loss, density.detach(), x0_pred, factor, used).requires_grad
+    nothing = cubewise_mean(loss, density, x0_pred, factor, torch.zeros_like(used))
+    assert nothing.item() == 0
+    assert (torch.autograd.grad(nothing, density)[0] == 0).all()
+
+
+def test_the_mean_cube_by_cube_passes_gradcheck():
+    density = torch.rand(2, 3, 3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1)).requires_grad_()
+    x0_pred = torch.linspace(-1, 1, 54).reshape(2, 3, 3, 3)
+    factor = torch.tensor([0.5, 3.0], dtype=torch.float64)[:, None, None, None]
+    loss = functools.partial(dsds_loss, target_density=0.1, fill_threshold=0.3)
+    assert torch.autograd.gradcheck(
+        lambda values: cubewise_mean(loss, values, x0_pred, factor, torch.ones(2, 3, 3, 3, dtype=torch.bool)), density
+    )

@@ -1,0 +1,185 @@
+"""What `clean` costs: speed against error of its settings, empty space, and memory against the number of cameras.
+
+    python benchmarks/cleaning.py
+
+Demo rooms that neither a threshold nor a picture has seen, every ghost labelled; a row for each setting that is
+changed from the defaults. Then the same room in a box twice as long whose other half is empty, with and without
+skipping; and the most memory that a fresh process holds while it cleans, or takes a step of score distillation, with
+more and more cameras. Writes docs/results/cleaning.json.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import resource
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from fit_cache import say
+
+from unghost import load_denoiser
+from unghost.core.cameras import Cameras
+from unghost.core.results import build_results, write_results
+from unghost.demo import score
+from unghost.demo_room import AABB, SHAPE, Room, build_room
+from unghost.denoisers import shipped_names
+from unghost.grids import cell_centers, grid_density_fn
+from unghost.regularizer.clean import clean
+
+ROOT = Path(__file__).resolve().parents[1]
+SETTINGS: dict[str, dict[str, Any]] = {
+    "cells only": {"level_weights": (1.0,)},
+    "twice the cell only": {"level_weights": (0.0, 1.0)},
+    "up to four times the cell": {"level_weights": (1.0, 0.5, 0.25)},
+    "no overlap": {"overlap": 0.0},
+    "overlap .25": {"overlap": 0.25},
+    "overlap .75": {"overlap": 0.75},
+    "bits": {"soft": False},
+}
+CAMERAS = (10, 100, 1000)
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to time.
+
+    Attributes:
+        seeds: of the rooms.
+        threads: of onnxruntime.
+        repeats: of the empty-space rows, of which the median is taken.
+        out: where cleaning.json goes.
+    """
+
+    seeds: tuple[int, ...] = (30, 31, 32)
+    threads: int = 2
+    repeats: int = 3
+    out: Path = ROOT / "docs" / "results"
+
+
+def setting_row(method: str, name: str, rooms: list[Room], threads: int, **settings: Any) -> dict[str, Any]:
+    """Mean scores of the rooms and the median of the seconds."""
+    denoiser, found, seconds = load_denoiser(name, threads=threads), [], []
+    for room in rooms:
+        begun = time.perf_counter()
+        mask = clean(
+            grid_density_fn(room.density, AABB), AABB, denoiser=denoiser, field_pitch=room.pitch, **settings
+        )  # fmt: skip
+        seconds.append(time.perf_counter() - begun)
+        found.append(
+            score(room, np.asarray(mask.keep(cell_centers(AABB, SHAPE)))) | {"windows": mask.details["windows"]}
+        )
+    keys = ("floater_recall", "floater_precision", "surface_kept", "iou_before", "iou", "windows")
+    row = {"method": method, "denoiser": name, "seconds": statistics.median(seconds)}
+    row |= {key: float(np.mean([scores[key] for scores in found])) for key in keys}
+    say(f"{method:28s} {row['floater_recall']:.3f} removed, {row['surface_kept']:.3f} kept, {row['seconds']:.1f} s")
+    return row
+
+
+def median_seconds(work: Callable[[], Any], repeats: int) -> tuple[float, Any]:
+    """Of a call, and what it returned last."""
+    taken = []
+    for _ in range(repeats):
+        begun = time.perf_counter()
+        result = work()
+        taken.append(time.perf_counter() - begun)
+    return statistics.median(taken), result
+
+
+def empty_rows(room: Room, options: Options) -> list[dict[str, Any]]:
+    """A room, without skipping what is empty, and in a box twice as long of which it fills one half."""
+    denoiser, field = load_denoiser(threads=options.threads), grid_density_fn(room.density, AABB)
+    box = np.array(AABB)
+    longer = np.stack([box[0], [2 * box[1, 0] - box[0, 0], *box[1, 1:]]])
+    ways = {"the room": (box, True), "the room, nothing skipped": (box, False), "a box twice as long": (longer, True)}
+    rows: list[dict[str, Any]] = []
+    places, kept = cell_centers(AABB, SHAPE), dict[str, Any]()
+    for method, (aabb, skip) in ways.items():
+
+        def work(aabb: Any = aabb, skip: bool = skip) -> Any:
+            return clean(field, aabb, denoiser=denoiser, field_pitch=room.pitch, skip_empty=skip)
+
+        seconds, mask = median_seconds(work, options.repeats)
+        kept[method] = np.asarray(mask.keep(places))
+        rows.append(
+            {
+                "method": method,
+                "seconds": seconds,
+                "times_the_room": seconds / rows[0]["seconds"] if rows else 1.0,
+                "windows": mask.details["windows"],
+                "same_mask": bool((kept[method] == kept["the room"]).all()),
+            }
+        )
+        say(f"{method}: {seconds:.2f} s, {rows[-1]['windows']} windows, same mask: {rows[-1]['same_mask']}")
+    return rows
+
+
+def ring(count: int) -> Cameras:
+    """Cameras in a room, looking out in a circle."""
+    angles = np.linspace(0.0, 2 * np.pi, count, endpoint=False)
+    poses, middle = np.zeros((count, 3, 4)), np.asarray(AABB).mean(axis=0)
+    back = np.stack([np.cos(angles), np.sin(angles), np.zeros(count)], axis=1)
+    up = np.broadcast_to([0.0, 0.0, 1.0], back.shape)
+    poses[:, :, 0], poses[:, :, 1], poses[:, :, 2], poses[:, :, 3] = np.cross(up, back), up, back, middle
+    return Cameras.create(poses, np.array([500.0, 500.0, 320.0, 240.0]), 640, 480)
+
+
+def _most_memory(what: str, count: int, pipe: Any) -> None:
+    """In a process of its own: megabytes held at most, beyond what was held before."""
+    room = build_room(30)
+    field, denoiser, cameras = grid_density_fn(room.density, AABB), load_denoiser("views", threads=2), ring(count)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    if what == "clean":
+        clean(field, AABB, denoiser=denoiser, field_pitch=room.pitch, cameras=cameras)
+    else:
+        from grid_field import GridField
+
+        from unghost.regularizer.regularizer import DensityRegularizer
+
+        torch_field = GridField(room.density, room.pitch)
+        regularizer = DensityRegularizer(denoiser, aabb=AABB, cameras=cameras, field_pitch=room.pitch)
+        for _ in range(3):
+            sum(regularizer(torch_field).values()).backward()  # type: ignore[union-attr]
+    pipe.send(
+        (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
+        / (1 << 10 if sys.platform != "darwin" else 1 << 20)
+    )
+
+
+def memory_rows() -> list[dict[str, Any]]:
+    """Each in a fresh process."""
+    rows: list[dict[str, Any]] = []
+    context = multiprocessing.get_context("spawn")
+    for what in ("clean", "dsds and visibility step"):
+        for count in CAMERAS:
+            ours, theirs = context.Pipe()
+            process = context.Process(target=_most_memory, args=(what, count, theirs))
+            process.start()
+            megabytes = ours.recv()
+            process.join()
+            rows.append({"method": f"memory, {what}", "cameras": count, "megabytes": megabytes})
+            say(f"{what}, {count} cameras: {megabytes:.0f} MB")
+    return rows
+
+
+def main() -> None:
+    options = tyro.cli(Options, description=__doc__)
+    rooms = [build_room(seed) for seed in options.seeds]
+    setting_row("warm-up", "default", rooms[:1], options.threads)
+    rows = [setting_row(f"clean, {name}", name, rooms, options.threads) for name in shipped_names()]
+    rows += [
+        setting_row(f"clean, {method}", "default", rooms, options.threads, **SETTINGS[method]) for method in SETTINGS
+    ]
+    rows += [*empty_rows(rooms[0], options), *memory_rows()]
+    results = build_results(rows, command="python benchmarks/cleaning.py", seeds=options.seeds, threads=options.threads)
+    write_results(options.out / "cleaning.json", results)
+
+
+if __name__ == "__main__":
+    main()
