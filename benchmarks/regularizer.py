@@ -5,9 +5,9 @@
 A step: 40 cubes of 32^3 of a fixed field (a room as a trilinear grid), with the shipped priors and with the paper's
 U-Net (random weights: its time does not depend on them) in the same harness; the field's own answers are timed apart.
 Visibility: 131,072 points in the box of a capture's cameras (its real, distorted lenses): every camera's exact test,
-the way of nerfstudio's published visibility field (pinholes, float32, 50 cameras at a time
-in one batched matrix product; our own writing of it), and ours with
-and without the cells that settle most points. Writes docs/results/regularizer.json.
+the way of nerfstudio's published visibility field (pinholes, float32, 50 cameras at a time in one batched matrix
+product; our own writing of it), and ours with and without the cells that settle most points. Filling: holes torn into
+a room (``regularizer_fill.py``). Writes docs/results/regularizer.json.
 """
 
 from __future__ import annotations
@@ -23,7 +23,9 @@ import numpy as np
 import torch
 import tyro
 from fit_cache import say
+from grid_field import GridField
 from numpy.typing import NDArray
+from regularizer_fill import fill_row
 
 from unghost import load_denoiser
 from unghost.core.cameras import Cameras
@@ -32,7 +34,6 @@ from unghost.core.results import build_results, write_results
 from unghost.demo_room import AABB, build_room
 from unghost.denoisers import shipped_names
 from unghost.evaluation.captures import load_capture
-from unghost.fields.trilinear import trilinear
 from unghost.prior.checkpoint import TorchDenoiser
 from unghost.prior.networks import build_network
 from unghost.prior.unet import UNetConfig
@@ -52,12 +53,14 @@ class Options:
         capture: folder of a capture: whose cameras to count.
         repeats: of which the median is taken; the U-Net's step is run twice.
         threads: of torch and onnxruntime.
+        fill_steps: of an optimiser, of holes torn into a room.
         out: where regularizer.json goes.
     """
 
     capture: tyro.conf.Positional[Path]
     repeats: int = 9
     threads: int = 2
+    fill_steps: int = 300
     out: Path = ROOT / "docs" / "results"
 
 
@@ -72,28 +75,10 @@ def median_seconds(work: Callable[[], Any], repeats: int) -> float:
     return statistics.median(taken)
 
 
-class Room(torch.nn.Module):
-    """The demo's room, ghosts and all, as a differentiable field."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.pitch = build_room(0).pitch
-        density = torch.from_numpy(build_room(0).density).float()
-        self.side = max(density.shape)
-        padded = torch.zeros((self.side,) * 3)
-        padded[: density.shape[0], : density.shape[1], : density.shape[2]] = density
-        self.table = torch.nn.Parameter(padded.reshape(-1, 1))
-        self.low, self.size = torch.tensor(np.asarray(AABB)[0]).float(), self.side * self.pitch
-
-    def forward(self, positions: torch.Tensor) -> torch.Tensor:
-        """Densities ``(M, 1)``."""
-        unit = ((positions - self.low) / self.size).clamp(0.0, 1.0)
-        return torch.relu(trilinear(self.table, unit * (self.side - 1), self.side))
-
-
 def step_rows(options: Options) -> list[dict[str, Any]]:
     """A step of score distillation, forward and backward, by denoiser."""
-    room, rows = Room(), []
+    scene, rows = build_room(0), []
+    room = GridField(scene.density, scene.pitch)
     denoisers: dict[str, Any] = {
         name: load_denoiser(name, backend="onnx", threads=options.threads) for name in shipped_names()
     }
@@ -110,7 +95,7 @@ def step_rows(options: Options) -> list[dict[str, Any]]:
     return rows
 
 
-def step_row(name: str, denoiser: Any, room: Room, repeats: int, cameras: Cameras | None = None) -> dict[str, Any]:
+def step_row(name: str, denoiser: Any, room: GridField, repeats: int, cameras: Cameras | None = None) -> dict[str, Any]:
     """One denoiser; the field's forward and its share of the backward are timed without it, too."""
     regularizer = DensityRegularizer(
         denoiser, aabb=AABB, field_pitch=room.pitch, skip_empty=False, cameras=cameras, visibility_weight=0.0
@@ -184,6 +169,7 @@ def main() -> None:
     options = tyro.cli(Options, description=__doc__)
     torch.set_num_threads(options.threads)
     rows = [*visibility_rows(options), *step_rows(options)]
+    rows += [fill_row(name, steps=options.fill_steps) for name in shipped_names()]
     command = f"python benchmarks/regularizer.py {options.capture.resolve().name}"
     write_results(
         options.out / "regularizer.json", build_results(rows, command=command, seeds=[0], threads=options.threads)
