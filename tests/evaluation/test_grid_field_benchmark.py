@@ -5,8 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-torch = pytest.importorskip("torch")
+pytest.importorskip("torch")
 pytest.importorskip("tyro")
+
+import torch
 
 from unghost.demo_room import AABB, SHAPE, build_room
 from unghost.grids import cell_centers
