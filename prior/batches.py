@@ -49,11 +49,18 @@ BLIND_SEVERITY = 0.8
 HARVEST_RECIPE = "harvest"  # what the provenance of cubes of fitted fields says
 
 
+ANY_EDGE = (0.01, 2.0)  # edge fractions that fields are cleaned at
 DEPTH_JITTER = 0.5  # of the logarithm of a harvested cube's optical depth: a field's cell is known but roughly
 
 
 def _harvested(shard: Shard) -> bool:
     return bool(shard.provenance.get("recipe") == HARVEST_RECIPE)
+
+
+def any_edge(rng: np.random.Generator) -> float:
+    """An edge fraction, log-uniform over ``ANY_EDGE``."""
+    low, high = np.log(ANY_EDGE)
+    return float(np.exp(rng.uniform(low, high)))
 
 
 def scale_depth(signed: NDArray[np.float32], factor: float) -> NDArray[np.float32]:
@@ -84,6 +91,7 @@ class _Draw:
     position: float
     depth: float
     dropped: frozenset[str]
+    edge_fraction: float
 
 
 def stored_channels(
@@ -133,11 +141,16 @@ class Mixture:
     [min(severity, BLIND_SEVERITY), 1], and which optional channels are dropped: the timestep says "at most this much
     corruption", from ``BLIND_SEVERITY`` on "any amount"; a clean cube is seen at every timestep.
 
+    Curated cubes belong to no scene, and harvested ones are larger parts of theirs: as it stands, the edge fraction
+    would tell them apart, and nothing learned from the curated ones would be of use in a field. So that of curated
+    cubes is drawn anew, log-uniform over ``ANY_EDGE``.
+
     Args:
         shards: folders and their weights.
         seed: see above.
         channels: of the batches.
         drop_channels: probability that an optional channel of a cube is made unknown, in [0, 1].
+        redraw_edges: as above; False leaves all edge fractions as they are.
     """
 
     def __init__(
@@ -147,6 +160,7 @@ class Mixture:
         seed: int,
         channels: Sequence[str] = (SIGNED_OPACITY,),
         drop_channels: float = 0.0,
+        redraw_edges: bool = True,
     ) -> None:
         if not shards:
             raise ValueError("Mixture: at least one training shard is needed")
@@ -160,7 +174,7 @@ class Mixture:
         for (path, _), shard in zip(shards, self.shards):
             if not len(shard):
                 raise ValueError(f"Mixture: {path} holds no cubes")
-        self.seed, self.drop_channels = seed, drop_channels
+        self.seed, self.drop_channels, self.redraw_edges = seed, drop_channels, redraw_edges
         self._cumulative = np.cumsum(weights) / weights.sum()
 
     def _draw(self, index: int) -> _Draw:
@@ -172,7 +186,10 @@ class Mixture:
         chances = rng.random(len(OPTIONAL_CHANNELS))  # by name: the order of channels is the caller's
         chance = dict(zip(OPTIONAL_CHANNELS, chances))
         dropped = frozenset(name for name, value in chance.items() if value < self.drop_channels)
-        return _Draw(shard, cube, symmetry, float(position), depth if _harvested(shard) else 1.0, dropped)
+        harvested, edge = _harvested(shard), any_edge(rng)
+        if harvested or not self.redraw_edges:
+            edge = float(shard.edge_fraction[cube])
+        return _Draw(shard, cube, symmetry, float(position), depth if harvested else 1.0, dropped, edge)
 
     def _channels(self, draw: _Draw) -> NDArray[np.float32]:
         """``(C, R, R, R)`` of one sample, its symmetry applied to all alike."""
@@ -188,7 +205,7 @@ class Mixture:
             np.stack([self._channels(d) for d in draws]),
             np.stack(labels),
             timesteps(severity, np.array([d.position for d in draws])),
-            np.array([d.shard.edge_fraction[d.cube] for d in draws], dtype=np.float32),
+            np.array([d.edge_fraction for d in draws], dtype=np.float32),
             np.array([_harvested(d.shard) for d in draws]),
         )
 

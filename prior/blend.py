@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.channels import stack_channels
-from .batches import Batch, Mixture, timesteps
+from .batches import Batch, Mixture, any_edge, timesteps
 
 STREAM = 0x6F6E6C  # keeps the timesteps of online samples apart from the draws of the mixture
 
@@ -65,16 +65,19 @@ class Blend:
         online: the sources. Their optional channels are unknown: they make cubes, not scenes.
         batch_size: cubes a step.
         channels: of the batches.
-        seed: of the timesteps of online samples, drawn as the mixture does.
+        seed: of the timesteps and the edge fractions of online samples, drawn as the mixture does.
+        redraw_edges: of online samples, as the mixture does.
 
     Raises:
         ValueError: shares that do not fit, shards without a part of the batch, or a part without shards.
     """
 
     def __init__(
-        self, mixture: Mixture | None, online: Sequence[Online], *, batch_size: int, channels: Sequence[str], seed: int
-    ) -> None:
+        self, mixture: Mixture | None, online: Sequence[Online], *, batch_size: int, channels: Sequence[str], seed: int,
+        redraw_edges: bool = True,
+    ) -> None:  # fmt: skip
         self.mixture, self.online, self.channels, self.seed = mixture, list(online), tuple(channels), seed
+        self.redraw_edges = redraw_edges
         self.counts = split_batch(batch_size, [part.share for part in online])
         if (mixture is None) == bool(self.counts[0]):
             have = "no shards" if mixture is None else "shards"
@@ -84,12 +87,14 @@ class Blend:
         """What a source gave, with timesteps, and with channels that say "unknown"."""
         count = len(pairs.labels)
         rows = range(step * count, (step + 1) * count)
-        position = np.array([np.random.default_rng([self.seed, row, STREAM, number]).random() for row in rows])
+        rngs = [np.random.default_rng([self.seed, row, STREAM, number]) for row in rows]
+        position = np.array([rng.random() for rng in rngs])
+        edges = [any_edge(rng) for rng in rngs] if self.redraw_edges else pairs.edge_fraction
         return Batch(
             stack_channels(self.channels, pairs.channels[:, 0], {}),
             pairs.labels,
             timesteps(pairs.severity, position),
-            np.asarray(pairs.edge_fraction, dtype=np.float32),
+            np.asarray(edges, dtype=np.float32),
             np.zeros(count, dtype=bool),
         )
 

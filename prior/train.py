@@ -223,11 +223,16 @@ def _run(
 
 def _blend(config: TrainConfig, shards: Sequence[tuple[str | Path, float]], online: Sequence[Online]) -> Blend:
     """The stream of batches of a run."""
-    names = config.network.channels
+    names, redraw = (
+        config.network.channels,
+        config.objective == "restoration",
+    )  # a diffusion learns scale, as in the paper
     mixture = None
     if shards or not online:
-        mixture = Mixture(shards, seed=config.seed, channels=names, drop_channels=config.drop_channels)
-    return Blend(mixture, online, batch_size=config.batch_size, channels=names, seed=config.seed)
+        mixture = Mixture(
+            shards, seed=config.seed, channels=names, drop_channels=config.drop_channels, redraw_edges=redraw
+        )
+    return Blend(mixture, online, batch_size=config.batch_size, channels=names, seed=config.seed, redraw_edges=redraw)
 
 
 def train(

@@ -14,6 +14,7 @@ from unghost.core.channels import (
 from unghost.core.packing import dequantize_signed, unpack_labels
 from unghost.core.shards import read_shard, write_shard
 from unghost.prior.batches import (
+    ANY_EDGE,
     BLIND_SEVERITY,
     DEPTH_JITTER,
     SYMMETRIES,
@@ -103,7 +104,22 @@ def test_values_come_from_the_shard(shard_paths):
     batch = mixture.batch(9, 1)
     assert np.array_equal(batch.channels[0, 0], apply_symmetry(dequantize_signed(shard.inputs[cube]), symmetry))
     assert np.array_equal(batch.labels[0], apply_symmetry(unpack_labels(shard.labels[cube : cube + 1])[0], symmetry))
-    assert batch.edge_fraction[0] == shard.edge_fraction[cube]
+    as_it_is = Mixture([(shard_paths["b"], 1.0)], seed=0, redraw_edges=False).batch(9, 1)
+    assert as_it_is.edge_fraction[0] == shard.edge_fraction[cube]
+    np.testing.assert_array_equal(as_it_is.channels, batch.channels)
+
+
+def test_edge_fractions_do_not_tell_curated_cubes_from_harvested_ones(shard_paths):
+    curated = Mixture([(shard_paths["b"], 1.0)], seed=0)
+    logs = np.log([curated._draw(index).edge_fraction for index in range(2000)])
+    low, high = np.log(ANY_EDGE)
+    assert logs.min() >= low
+    assert logs.max() <= high
+    quantiles = np.quantile(logs, [0.25, 0.5, 0.75])
+    np.testing.assert_allclose(quantiles, low + (high - low) * np.array([0.25, 0.5, 0.75]), atol=0.25)
+    harvested, shard = Mixture([(shard_paths["seen"], 1.0)], seed=0), read_shard(shard_paths["seen"])
+    for draw in map(harvested._draw, range(20)):
+        assert draw.edge_fraction == shard.edge_fraction[draw.cube]
 
 
 def test_scaled_depth_is_that_of_a_scaled_density():

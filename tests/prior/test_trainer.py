@@ -94,7 +94,8 @@ def test_warm_start(tiny_config, tmp_path):
     assert torch.equal(trainer.network.stem.weight, network.stem.weight)
     assert torch.equal(trainer.average.shadow["stem.weight"], network.stem.weight)
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    assert trainer.started_from == {"name": "start", "sha256": digest, "steps": 7}
+    seen = ["signed_opacity"]
+    assert trainer.started_from == {"name": "start", "sha256": digest, "channels": seen, "steps": 7}
     assert Trainer(tiny_config).started_from is None
     with pytest.raises(ValueError, match="has another network"):
         Trainer(dataclasses.replace(config, network=NetworkConfig(widths=(16, 8, 8))))
