@@ -33,6 +33,7 @@ SEED = 77
 SEVERITIES = (0.1, 0.3, 0.5, 0.8, 1.0)
 MIXED = "mixed"
 BUBBLES = ("bits", "soft")  # the families of the set of that name
+FIELD_EDGE = 0.5
 CAPTURE_CUBES = 160  # of each of three fields
 
 
@@ -137,7 +138,8 @@ def bubble_sets(clean: CubeSet) -> Iterator[CubeSet]:
     """What a learned distance grows where no photo looks: closed smooth bodies in free space, beside clean surface.
 
     As bits, and as the opacity of VolSDF's Laplace density of both (scale .7 of a voxel). Such bodies are no
-    corruption of the recipes, whose blobs are lumpy.
+    corruption of the recipes, whose blobs are lumpy. The edge fraction is that of a window of ``clean`` in a field of
+    64 cells: larger than any that curated cubes have.
     """
     from scipy.ndimage import distance_transform_edt
 
@@ -148,7 +150,9 @@ def bubble_sets(clean: CubeSet) -> Iterator[CubeSet]:
     density = laplace_density(distance.astype(np.float32), beta=0.7)
     soft = signed_from_opacity(opacity_from_density(density, 1.0))
     for family, signed in zip(BUBBLES, (bits, soft)):
-        yield dataclasses.replace(clean, name="bubbles", about={"family": family}, signed=signed)
+        edges = np.full_like(clean.edge_fraction, FIELD_EDGE)
+        about = {"family": family}
+        yield dataclasses.replace(clean, name="bubbles", about=about, signed=signed, edge_fraction=edges)
 
 
 def mesh_sets(meshes: Path, count: int, few: int) -> Iterator[CubeSet]:
