@@ -50,6 +50,7 @@ HARVEST_RECIPE = "harvest"  # what the provenance of cubes of fitted fields says
 
 
 ANY_EDGE = (0.01, 2.0)  # edge fractions that fields are cleaned at
+FINER = 8.0  # a field may have so many times the cells, along an axis, of those that were harvested
 DEPTH_JITTER = 0.5  # of the logarithm of a harvested cube's optical depth: a field's cell is known but roughly
 
 
@@ -143,7 +144,7 @@ class Mixture:
 
     Curated cubes belong to no scene, and harvested ones are larger parts of theirs: as it stands, the edge fraction
     would tell them apart, and nothing learned from the curated ones would be of use in a field. So that of curated
-    cubes is drawn anew, log-uniform over ``ANY_EDGE``.
+    cubes is drawn anew, log-uniform over ``ANY_EDGE``, and that of harvested ones divided by 1 to ``FINER``.
 
     Args:
         shards: folders and their weights.
@@ -186,9 +187,9 @@ class Mixture:
         chances = rng.random(len(OPTIONAL_CHANNELS))  # by name: the order of channels is the caller's
         chance = dict(zip(OPTIONAL_CHANNELS, chances))
         dropped = frozenset(name for name, value in chance.items() if value < self.drop_channels)
-        harvested, edge = _harvested(shard), any_edge(rng)
-        if harvested or not self.redraw_edges:
-            edge = float(shard.edge_fraction[cube])
+        harvested, edge, anew = _harvested(shard), float(shard.edge_fraction[cube]), any_edge(rng)
+        if self.redraw_edges:
+            edge = edge * float(np.exp(-rng.uniform(0.0, np.log(FINER)))) if harvested else anew
         return _Draw(shard, cube, symmetry, float(position), depth if harvested else 1.0, dropped, edge)
 
     def _channels(self, draw: _Draw) -> NDArray[np.float32]:
