@@ -173,6 +173,7 @@ def main() -> None:
     rooms = [build_room(seed) for seed in options.seeds]
     setting_row("warm-up", "default", rooms[:1], options.threads)
     rows = [setting_row(f"clean, {name}", name, rooms, options.threads) for name in shipped_names()]
+    rows.append(setting_row("clean, views, 40 cameras", "views", rooms, options.threads, cameras=ring(40)))
     rows += [
         setting_row(f"clean, {method}", "default", rooms, options.threads, **SETTINGS[method]) for method in SETTINGS
     ]

@@ -33,7 +33,7 @@ SEED = 77
 SEVERITIES = (0.1, 0.3, 0.5, 0.8, 1.0)
 MIXED = "mixed"
 BUBBLES = ("bits", "soft")  # the families of the set of that name
-FIELD_EDGE = 0.5
+FIELD_EDGE, IN_A_FIELD = 0.5, 0.8  # the edge fraction, and the severity of the mixed corruption shown at it
 CAPTURE_CUBES = 160  # of each of three fields
 
 
@@ -134,12 +134,20 @@ def _with_bubbles(rng: np.random.Generator, surface: NDArray[np.bool_]) -> NDArr
     return result
 
 
+def as_in_a_field(cubes: CubeSet) -> CubeSet:
+    """Cubes at the edge fraction of a window of ``clean`` in a field of 64 cells, larger than any that curated
+    cubes have: a prior that takes it for a hint about the content does worse."""
+    edges = np.full_like(cubes.edge_fraction, FIELD_EDGE)
+    about = {"severity": cubes.about["severity"]} if "severity" in cubes.about else cubes.about
+    name = "synthetic-in-a-field" if "severity" in about else cubes.name
+    return dataclasses.replace(cubes, name=name, about=about, edge_fraction=edges)
+
+
 def bubble_sets(clean: CubeSet) -> Iterator[CubeSet]:
     """What a learned distance grows where no photo looks: closed smooth bodies in free space, beside clean surface.
 
     As bits, and as the opacity of VolSDF's Laplace density of both (scale .7 of a voxel). Such bodies are no
-    corruption of the recipes, whose blobs are lumpy. The edge fraction is that of a window of ``clean`` in a field of
-    64 cells: larger than any that curated cubes have.
+    corruption of the recipes, whose blobs are lumpy. The edge fraction is a field's.
     """
     from scipy.ndimage import distance_transform_edt
 
@@ -150,9 +158,7 @@ def bubble_sets(clean: CubeSet) -> Iterator[CubeSet]:
     density = laplace_density(distance.astype(np.float32), beta=0.7)
     soft = signed_from_opacity(opacity_from_density(density, 1.0))
     for family, signed in zip(BUBBLES, (bits, soft)):
-        edges = np.full_like(clean.edge_fraction, FIELD_EDGE)
-        about = {"family": family}
-        yield dataclasses.replace(clean, name="bubbles", about=about, signed=signed, edge_fraction=edges)
+        yield as_in_a_field(dataclasses.replace(clean, name="bubbles", about={"family": family}, signed=signed))
 
 
 def mesh_sets(meshes: Path, count: int, few: int) -> Iterator[CubeSet]:
@@ -182,6 +188,7 @@ def mesh_sets(meshes: Path, count: int, few: int) -> Iterator[CubeSet]:
     yield from bubble_sets(known)
     for severity in SEVERITIES:
         yield damaged(known, MIXED, severity)
+    yield as_in_a_field(damaged(known, MIXED, IN_A_FIELD))
     for family in CORRUPTIONS:
         for severity in SEVERITIES:
             yield damaged(known.first(few), family, severity)

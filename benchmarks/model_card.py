@@ -14,13 +14,15 @@ from typing import Any
 
 from readme import ROOT, load, number, table
 
+from unghost.core.channels import VIEW_COUNT
 from unghost.core.manifest import Manifest
 from unghost.export.container import precision_of
 from unghost.export.runtime import read_manifest
 from unghost.prior.network import SIZES, RestorationNet, parameter_count
 
 WEIGHTS = ROOT / "unghost" / "weights"
-OLDER = ("default",)  # its provenance is of another form; its card was written when it was shipped
+CALLED = {"default": "unghost"}  # in the reference measurement
+OLDER = ("m",)  # its provenance is of another form; its card was written when it was shipped
 DATA = """unghost curate procedural --out out/procedural --n 64000 --seed 0 --workers 2
 unghost curate meshes --out out/meshes --n 40000 --seed 0 --workers 2 --mesh-root MESHES
 unghost harvest --out out/rooms --scenes 80 --first 4 --seed 1000 --cubes 112 --no-fit --workers 2 --mesh-root MESHES
@@ -28,19 +30,22 @@ unghost harvest --out out/harvest-train --scenes 128 --seed 0 --workers 2 --mesh
 LICENCES = (
     "Procedural solids, synthetic rooms and harvested fields are made by this project; the meshes are CC0-1.0 and "
     "MIT-0 only (KayKit, Quaternius, Kenney, AWS RoboMaker worlds), `train` split; none is in this repository. Scenes "
-    "whose fit failed are given up by `unghost harvest`."
+    "whose fit failed are given up by `unghost harvest`. Runs at commit `e3fec21538ce` learned from procedural and "
+    "mesh cubes curated at that commit, later ones from cubes of the recipes as they are now (soft ones have changed)."
 )
 ABOUT = (
     "A restoration prior: reads one 32³ cube of signed opacity (−1 empty … +1 opaque; bits are a special case) and "
-    "says in one step which voxels are surface (`x0_pred`, −1 … +1). Of each voxel it also takes how many training "
-    "photos have it in their frustum (`view_count`), which may be left unknown. `timestep / 999` is the most "
-    "corruption to expect; from 800 on: any amount."
+    "says in one step which voxels are surface (`x0_pred`, −1 … +1). `timestep / 999` is the most corruption to "
+    "expect; from 800 on: any amount."
+)
+VIEWS = (
+    " Of each voxel it also takes how many training photos have it in their frustum (`view_count`), which may be left "
+    "unknown."
 )
 LIMITS = (
-    "Round, solid-looking blobs in the air often stay: the default removes those better. Harvested were dense grids "
-    "and hash grids fitted to synthetic rooms, few photos each; on a real capture's field the scores fall off, and "
-    "without view counts on every kind of field. Surfaces thinner than a voxel may go. The set `capture` is a real "
-    "capture that was not trained on, but has been looked at while the method was made."
+    "Harvested were dense grids and hash grids fitted to synthetic rooms, few photos each; on a real capture's field "
+    "the scores fall off, and without view counts on every kind of field. Surfaces thinner than a voxel may go. The "
+    "set `capture` is a real capture that was not trained on, but has been looked at while the method was made."
 )
 
 
@@ -84,8 +89,8 @@ def train_commands(manifest: Manifest) -> list[str]:
     for index, stage in enumerate(stages(manifest.training)):
         shards = " ".join(f"out/{source}={share}" for source, _, _, share in sources(stage["shards"]))
         dropped = stage.get("drop_channels", manifest.training["drop_channels"])
-        seen = f" --channels {' '.join(manifest.channels)} --drop-channels {dropped:g}"
-        seen = "" if len(manifest.channels) == 1 else seen
+        channels = stage.get("channels", manifest.channels)
+        seen = f" --channels {' '.join(channels)} --drop-channels {dropped:g}" if len(channels) > 1 else ""
         online = "".join(f" --online {part['name']}={part['share']:g}" for part in stage.get("online", []))
         start = f" --init-from {run_folder(manifest, index - 1)}/model.safetensors" if index else ""
         commands.append(
@@ -132,11 +137,12 @@ def section(name: str, path: Path, manifest: Manifest) -> list[str]:
 
 def scores(name: str) -> list[str]:
     """The rows of the reference measurement about a model."""
+    called = CALLED.get(name, name)
     rows = [
-        [row["method"].removeprefix(name).removeprefix(", ") or "–", row["set"], str(row.get("severity", "–")),
+        [row["method"].removeprefix(called).removeprefix(", ") or "–", row["set"], str(row.get("severity", "–")),
          str(row["cubes"]), *(number(row[k]) for k in ("iou_before", "iou", "ghosts_removed_98", "ghosts_removed_90"))]
         for row in load("denoise")["rows"]
-        if row.get("model") == name and "cubes" in row and row.get("family", "mixed") == "mixed"
+        if row.get("model") == called and "cubes" in row and row.get("family", "mixed") in ("mixed", "bits", "soft")
     ]  # fmt: skip
     head = ("told", "set", "severity", "cubes", "IoU before", "after", "ghosts removed at .98 kept", "at .90")
     return [*table(head, rows), ""] if rows else []
@@ -144,7 +150,7 @@ def scores(name: str) -> list[str]:
 
 def card(name: str, path: Path, manifest: Manifest) -> str:
     lines = [
-        f"# {name}", "", ABOUT, "",
+        f"# {name}", "", ABOUT + (VIEWS if VIEW_COUNT in manifest.channels else ""), "",
         *section(name, path, manifest),
         "## The data", "", "```", DATA, "```", "", LICENCES, "",
         "Scores above are of the reference measurement (`benchmarks/denoise.py`, docs/results/denoise.json), on what "
