@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from unghost.core.occupancy import (
     FREE_LABEL,
+    IGNORE_LABEL,
     SURFACE_LABEL,
     opacity_from_density,
     signed_from_occupancy,
@@ -147,7 +148,8 @@ def bubble_sets(clean: CubeSet) -> Iterator[CubeSet]:
     """What a learned distance grows where no photo looks: closed smooth bodies in free space, beside clean surface.
 
     As bits, and as the opacity of VolSDF's Laplace density of both (scale .7 of a voxel). Such bodies are no
-    corruption of the recipes, whose blobs are lumpy. The edge fraction is a field's.
+    corruption of the recipes, whose blobs are lumpy. The edge fraction is a field's. Of soft cubes the two voxels about
+    a surface, its skirt, do not count.
     """
     from scipy.ndimage import distance_transform_edt
 
@@ -158,7 +160,12 @@ def bubble_sets(clean: CubeSet) -> Iterator[CubeSet]:
     density = laplace_density(distance.astype(np.float32), beta=0.7)
     soft = signed_from_opacity(opacity_from_density(density, 1.0))
     for family, signed in zip(BUBBLES, (bits, soft)):
-        yield as_in_a_field(dataclasses.replace(clean, name="bubbles", about={"family": family}, signed=signed))
+        labels = clean.labels.copy()
+        if family == "soft":
+            skirt = np.stack([dilate(cube, 2) for cube in surface]) & ~surface
+            labels[skirt] = IGNORE_LABEL
+        bubbles = dataclasses.replace(clean, name="bubbles", about={"family": family}, signed=signed, labels=labels)
+        yield as_in_a_field(bubbles)
 
 
 def mesh_sets(meshes: Path, count: int, few: int) -> Iterator[CubeSet]:

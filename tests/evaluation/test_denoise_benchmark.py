@@ -296,5 +296,8 @@ def test_bubbles_are_whole_ghosts_clear_of_the_surface(parts):
     # half way into a body of several voxels, nearly opaque; far from all, nearly clear
     assert soft.signed[0, 10, 10, 15] > 0
     assert soft.signed[0, 0, 0, 0] < -0.9
+    assert (soft.labels[0, 10, 10, 12:14] == IGNORE_LABEL).all()  # the plate's skirt
+    assert (soft.labels[0][bubbles[0]] == FREE_LABEL).all()
+    assert (bits.labels == clean.labels).all()
     again = next(parts["sets"].bubble_sets(clean))
     np.testing.assert_array_equal(bits.signed, again.signed)
