@@ -57,7 +57,9 @@ def draw(path: Path, rows: Sequence[dict[str, Any]]) -> None:
             axis.plot(speed, value, "o", color="#2a7f62", fillstyle="full" if named else "none")
             if not named:
                 continue
-            axis.annotate(method, (speed, value), xytext=(5, 4), textcoords="offset points", fontsize=8)
+            left = speed == max(s for _, s, _ in timed)  # the fastest one's name would leave the panel
+            axis.annotate(method, (speed, value), xytext=(-5 if left else 5, 6), textcoords="offset points", fontsize=8,
+                          ha="right" if left else "left")  # fmt: skip
         front = [timed[index] for index in pareto([(speed, value) for _, speed, value in timed])]
         axis.plot([speed for _, speed, _ in front], [value for _, _, value in front], color="#2a7f62", linewidth=1)
         filters = {m: v for m, v in found.items() if v is not None and models[m] is None}

@@ -86,10 +86,14 @@ def run_folder(manifest: Manifest, number: int) -> str:
 def train_commands(manifest: Manifest) -> list[str]:
     """What trained it, up to the folders' places; a command a stage."""
     commands = []
-    for index, stage in enumerate(stages(manifest.training)):
+    every = stages(manifest.training)
+    for index, stage in enumerate(every):
         shards = " ".join(f"out/{source}={share}" for source, _, _, share in sources(stage["shards"]))
-        dropped = stage.get("drop_channels", manifest.training["drop_channels"])
-        channels = stage.get("channels", manifest.channels)
+        later = [
+            *every[index:],
+            {"channels": manifest.channels},
+        ]  # an early run's record lacks what its successor's has
+        dropped, channels = (next(s[key] for s in later if key in s) for key in ("drop_channels", "channels"))
         seen = f" --channels {' '.join(channels)} --drop-channels {dropped:g}" if len(channels) > 1 else ""
         online = "".join(f" --online {part['name']}={part['share']:g}" for part in stage.get("online", []))
         start = f" --init-from {run_folder(manifest, index - 1)}/model.safetensors" if index else ""
@@ -139,8 +143,9 @@ def scores(name: str) -> list[str]:
     """The rows of the reference measurement about a model."""
     called = CALLED.get(name, name)
     rows = [
-        [row["method"].removeprefix(called).removeprefix(", ") or "–", row["set"], str(row.get("severity", "–")),
-         str(row["cubes"]), *(number(row[k]) for k in ("iou_before", "iou", "ghosts_removed_98", "ghosts_removed_90"))]
+        [row["method"].removeprefix(called).removeprefix(", ") or "–", row["set"],
+         str(row.get("severity", row.get("family", "–"))), str(row["cubes"]),
+         *(number(row[k]) for k in ("iou_before", "iou", "ghosts_removed_98", "ghosts_removed_90"))]
         for row in load("denoise")["rows"]
         if row.get("model") == called and "cubes" in row and row.get("family", "mixed") in ("mixed", "bits", "soft")
     ]  # fmt: skip
