@@ -124,13 +124,13 @@ def _model(row: Row, found: dict[Any, Row]) -> list[str]:
 
 
 def _beaten(found: dict[Any, Row], name: str, shown: list[str]) -> str:
-    """A sentence if none of the shipped priors is the best on a set of fog."""
+    """Which of the shipped priors lose to something else on a set of fog, in a sentence."""
     scores = {key[0]: row["ghosts_removed_98"] for key, row in found.items() if key[1] == name and key[0] in shown}
-    best = max(scores, key=lambda method: scores[method])
-    if best in SHIPPED:
+    best = max((method for method in scores if method.split(",")[0] not in SHIPPED), key=lambda method: scores[method])
+    losing = [f"{method} ({scores[method]:.3f})" for method in SHIPPED if scores.get(method, 1.0) < scores[best]]
+    if not losing:
         return ""
-    mine = max(SHIPPED, key=lambda method: scores.get(method, -1.0))
-    return f"On {FOG[name]} {mine} **loses** to {best} at .98 kept ({scores[mine]:.3f} against {scores[best]:.3f})."
+    return f"At .98 kept, on {FOG[name]}, {best} ({scores[best]:.3f}) **beats** {', '.join(losing)}."
 
 
 def _removed(row: Row) -> str:
