@@ -58,7 +58,7 @@ def draw(path: Path, rows: Sequence[dict[str, Any]]) -> None:
             if not named:
                 continue
             left = speed == max(s for _, s, _ in timed)  # the fastest one's name would leave the panel
-            axis.annotate(method, (speed, value), xytext=(-5 if left else 5, 6), textcoords="offset points", fontsize=8,
+            axis.annotate(method, (speed, value), xytext=(-5, -12) if left else (5, 6), textcoords="offset points", fontsize=8,
                           ha="right" if left else "left")  # fmt: skip
         front = [timed[index] for index in pareto([(speed, value) for _, speed, value in timed])]
         axis.plot([speed for _, speed, _ in front], [value for _, _, value in front], color="#2a7f62", linewidth=1)
