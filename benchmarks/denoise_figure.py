@@ -58,8 +58,8 @@ def draw(path: Path, rows: Sequence[dict[str, Any]]) -> None:
             if not named:
                 continue
             left = speed == max(s for _, s, _ in timed)  # the fastest one's name would leave the panel
-            axis.annotate(method, (speed, value), xytext=(-5, -12) if left else (5, 6), textcoords="offset points", fontsize=8,
-                          ha="right" if left else "left")  # fmt: skip
+            offset, side = ((-5, -12), "right") if left else ((5, 6), "left")
+            axis.annotate(method, (speed, value), xytext=offset, textcoords="offset points", fontsize=8, ha=side)
         front = [timed[index] for index in pareto([(speed, value) for _, speed, value in timed])]
         axis.plot([speed for _, speed, _ in front], [value for _, _, value in front], color="#2a7f62", linewidth=1)
         filters = {m: v for m, v in found.items() if v is not None and models[m] is None}
