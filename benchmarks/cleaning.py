@@ -13,7 +13,6 @@ from __future__ import annotations
 import multiprocessing
 import statistics
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from typing import Any
 import numpy as np
 import tyro
 from fit_cache import say
+from timing import median_seconds
 
 from unghost import load_denoiser
 from unghost.core.cameras import Cameras
@@ -78,16 +78,6 @@ def setting_row(method: str, name: str, rooms: list[Room], threads: int, **setti
     row |= {key: float(np.mean([scores[key] for scores in found])) for key in keys}
     say(f"{method:28s} {row['floater_recall']:.3f} removed, {row['surface_kept']:.3f} kept, {row['seconds']:.1f} s")
     return row
-
-
-def median_seconds(work: Callable[[], Any], repeats: int) -> tuple[float, Any]:
-    """Of a call, and what it returned last."""
-    taken = []
-    for _ in range(repeats):
-        begun = time.perf_counter()
-        result = work()
-        taken.append(time.perf_counter() - begun)
-    return statistics.median(taken), result
 
 
 def empty_rows(room: Room, options: Options) -> list[dict[str, Any]]:

@@ -12,8 +12,6 @@ a room (``regularizer_fill.py``). Writes docs/results/regularizer.json.
 
 from __future__ import annotations
 
-import statistics
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +24,7 @@ from fit_cache import say
 from grid_field import GridField
 from numpy.typing import NDArray
 from regularizer_fill import fill_row
+from timing import median_seconds
 
 from unghost import load_denoiser
 from unghost.core.cameras import Cameras
@@ -62,17 +61,6 @@ class Options:
     threads: int = 2
     fill_steps: int = 300
     out: Path = ROOT / "docs" / "results"
-
-
-def median_seconds(work: Callable[[], Any], repeats: int) -> float:
-    """Of a call, after one that does not count."""
-    work()
-    taken = []
-    for _ in range(repeats):
-        begun = time.perf_counter()
-        work()
-        taken.append(time.perf_counter() - begun)
-    return statistics.median(taken)
 
 
 def step_rows(options: Options) -> list[dict[str, Any]]:
@@ -116,8 +104,8 @@ def step_row(name: str, denoiser: Any, room: GridField, repeats: int, cameras: C
         room.zero_grad()
         torch.cat([room(positions) for positions in asked]).mean().backward()
 
-    seconds = median_seconds(step, repeats)
-    alone = median_seconds(queries, repeats)
+    seconds, _ = median_seconds(step, repeats)
+    alone, _ = median_seconds(queries, repeats)
     return {"method": f"dsds step, {name}", "cubes": regularizer.settings.cubes, "seconds": seconds,
             "seconds_of_queries": alone, "seconds_beside": seconds - alone}  # fmt: skip
 
@@ -156,10 +144,10 @@ def visibility_rows(options: Options) -> list[dict[str, Any]]:
     }
     truth, rows = cameras.view_count(points) > 0, []
     for name, way in ways.items():
-        seconds = median_seconds(way, options.repeats)
+        seconds, found = median_seconds(way, options.repeats)
         rows.append({"method": f"visibility, {name}", "points": POINTS, "cameras": len(cameras), "seconds": seconds,
                      "tests_per_second": POINTS * len(cameras) / seconds,
-                     "disagreement": float(((way() > 0) != truth).mean())})  # fmt: skip
+                     "disagreement": float(((found > 0) != truth).mean())})  # fmt: skip
         say(f"{name}: {seconds * 1e3:.1f} ms, {rows[-1]['tests_per_second'] / 1e6:.0f} M tests/s, "
             f"{rows[-1]['disagreement']:.2%} differ")  # fmt: skip
     return rows

@@ -75,11 +75,11 @@ class OccupancyRule:
 
     @classmethod
     def paper(cls) -> OccupancyRule:
-        """``density > 0.01``, with w = 0.01: the paper's tau = w."""
+        """``density > 0.01``: the paper's tau."""
         return cls("density", PAPER_DENSITY_THRESHOLD)
 
     def density_threshold(self, pitch: Array | float) -> Array | float:
-        """The density at which a voxel becomes occupied; also ``w`` of the DSDS loss (eq. 2)."""
+        """The density at which a voxel becomes occupied (the paper's tau)."""
         if self.kind == "density":
             return self.threshold
         return -math.log1p(-self.threshold) / pitch

@@ -250,10 +250,10 @@ class DensityRegularizer:
             self._refresh(*cubes.thinned(density.detach(), used))
         x0_pred = self._predict(density.detach(), cubes, field, index)
         factor = cubes.pitch if self.settings.rule.kind == "opacity" else torch.ones_like(cubes.pitch)
-        target = float(self.settings.rule.density_threshold(1.0))
         loss = functools.partial(
-            dsds_loss, target_density=target, threshold=self.threshold, fill_threshold=self.fill_threshold
-        )
+            dsds_loss, target_density=self.settings.target_density(),
+            threshold=self.threshold, fill_threshold=self.fill_threshold,
+        )  # fmt: skip
         return cubewise_mean(loss, density, x0_pred, factor, used)
 
     def _predict(self, density: Tensor, cubes: CubeBatch, field: DensityFn, index: int) -> Tensor:

@@ -14,6 +14,9 @@ from .visibility import PointKind
 
 Timestep = int | Callable[[int], int] | None
 
+# At the threshold itself a filled voxel would never count as occupied: nothing beside it could grow from there.
+FILLED_OPACITY = 0.9
+
 
 @dataclass(frozen=True)
 class RegularizerSettings:
@@ -29,6 +32,8 @@ class RegularizerSettings:
         timestep: for the denoiser; None for its default, or a function of the step.
         threshold: ``x0_pred`` below it is pushed out (0: the paper); None for what the manifest advises ``clean``.
         fill_threshold: ``x0_pred`` at or above it is filled; None for 0 (the paper) or ``threshold`` if higher.
+        target: ``w`` of eq. 2, up to which it is filled: an opacity of a field cell in (0, 1), or a density > 0 under
+            the density rule, at or above the rule's threshold. None for .9, under the density rule for its threshold.
         dsds_weight, visibility_weight: factors of the losses; 0 switches one off, its queries too. Under the
             opacity rule the losses are optical depths per cell, so the weights do not depend on the scene's unit.
         visibility_samples: points a step for the visibility loss.
@@ -54,6 +59,7 @@ class RegularizerSettings:
     timestep: Timestep = None
     threshold: float | None = 0.0
     fill_threshold: float | None = None
+    target: float | None = None
     dsds_weight: float = 0.1
     visibility_weight: float = 1.0
     visibility_samples: int = 32768
@@ -91,6 +97,8 @@ class RegularizerSettings:
             "visibility_kind": (self.visibility_kind in ("mixed", "rays", "uniform"), "mixed, rays or uniform"),
             "edge_range": (self.edge_range is None or _is_range(self.edge_range), "0 < low <= high, finite"),
             "threshold": (self.threshold is None or -1 <= self.threshold <= 1, "in [-1, 1]"),
+            "target": (self.target is None or self.rule.threshold <= self.target < self._most_target(),
+                       f"in [{self.rule.threshold} (the rule's threshold), {self._most_target()})"),
             "fill_threshold": (self.fill_threshold is None or -1 <= self.fill_threshold <= 1, "in [-1, 1]"),
         }  # fmt: skip
         for name, (holds, rule) in rules.items():
@@ -98,6 +106,16 @@ class RegularizerSettings:
                 raise ValueError(f"DensityRegularizer: {name} must be {rule}, got {getattr(self, name)!r}")
         if self.timestep is not None and not callable(self.timestep):
             check_timestep(self.timestep, caller="DensityRegularizer")
+
+    def _most_target(self) -> float:
+        return 1.0 if self.rule.kind == "opacity" else math.inf
+
+    def target_density(self) -> float:
+        """``w`` as the loss takes it: an optical depth of a cell, under the density rule a density."""
+        if self.rule.kind == "density":
+            return self.rule.threshold if self.target is None else self.target
+        opacity = max(FILLED_OPACITY, self.rule.threshold) if self.target is None else self.target
+        return -math.log1p(-opacity)
 
 
 def _is_range(edge_range: tuple[float, float]) -> bool:

@@ -8,8 +8,6 @@ from unghost.core.occupancy import OccupancyRule
 from unghost.regularizer.regularizer import DensityRegularizer
 from unghost.regularizer.settings import RegularizerSettings
 
-TARGET = -math.log1p(-0.1)  # optical depth at which a cell becomes occupied
-
 
 def build(kit, aabb, predict, *, kind="numpy", **settings):
     maker = kit.numpy_denoiser if kind == "numpy" else kit.torch_denoiser
@@ -57,12 +55,35 @@ def test_calls_between_cost_nothing(kit, aabb):
 
 def test_filling_by_hand(kit, aabb):
     level = torch.tensor(1.0, requires_grad=True)
-    rule = OccupancyRule("opacity", 0.2)
-    regularizer, _ = build(kit, aabb, kit.all_full, rule=rule, skip_empty=False)
+    regularizer, _ = build(kit, aabb, kit.all_full, target=0.2, skip_empty=False)
     loss = regularizer(lambda p: level.expand(len(p)))["dsds"]
     assert loss.item() == pytest.approx(-math.log(0.8) - 0.125, rel=1e-6)  # w - density * pitch
     loss.backward()
     assert level.grad.item() == pytest.approx(-0.125, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ({}, -math.log(0.1)),
+        ({"rule": OccupancyRule("opacity", 0.95)}, -math.log(0.05)),
+        ({"target": 0.5}, math.log(2)),
+        ({"rule": OccupancyRule.paper()}, 0.01),
+        ({"rule": OccupancyRule.paper(), "target": 20.0}, 20.0),
+    ],
+)
+def test_what_is_filled_counts_as_occupied(settings, expected):
+    found = RegularizerSettings(**settings)
+    assert found.target_density() == pytest.approx(expected)
+    assert found.target_density() >= found.rule.density_threshold(1.0)
+
+
+@pytest.mark.parametrize(
+    "settings", [{"target": 0.05}, {"target": 1.0}, {"rule": OccupancyRule.paper(), "target": 0.001}]
+)
+def test_a_target_below_what_is_occupied_is_refused(settings):
+    with pytest.raises(ValueError, match=r"target must be in .*the rule's threshold"):
+        RegularizerSettings(**settings)
 
 
 def test_the_papers_rule_is_raw_density_and_bits(kit, aabb):
