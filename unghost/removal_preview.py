@@ -38,10 +38,8 @@ def _side(kept: NDArray[np.bool_], removed: NDArray[np.bool_], axis: int) -> NDA
     """The box seen along an axis, ``(rows, columns, 3)`` in [0, 1]: kept cells grey, nearer ones lighter; removed ones
     orange and half transparent."""
     kept, removed = np.moveaxis(kept, axis, 0), np.moveaxis(removed, axis, 0)
-    if axis != 2:  # from the front and from the side: up is up
-        kept, removed = kept[::-1] if axis == 0 else kept, removed[::-1] if axis == 0 else removed
-    else:
-        kept, removed = kept[::-1], removed[::-1]  # from above
+    if axis != 1:  # from +x, from -y and from +z the other axes run to the right and up, nothing mirrored
+        kept, removed = kept[::-1], removed[::-1]
     first = np.where(kept.any(axis=0), kept.argmax(axis=0), len(kept)) / len(kept)
     shade = np.where(first < 1.0, NEAR + (FAR - NEAR) * first, 1.0)
     edge = np.abs(np.diff(first, axis=0, append=first[-1:])) + np.abs(np.diff(first, axis=1, append=first[:, -1:]))
@@ -52,7 +50,8 @@ def _side(kept: NDArray[np.bool_], removed: NDArray[np.bool_], axis: int) -> NDA
 
 
 def preview_png(mask: KeepMask, occupied: NDArray[np.bool_]) -> bytes:
-    """Seen along x, y and from above (z up): what stays in grey, what would go in orange."""
+    """Seen from +x (y to the right), from -y (x to the right) and from above: what stays in grey, what would go in
+    orange."""
     kept, removed = occupied & mask.cells, ~mask.cells
     scale = max(1, -(-SIDE // max(mask.cells.shape)))
     views = [_side(kept, removed, axis).repeat(scale, axis=0).repeat(scale, axis=1) for axis in range(3)]
