@@ -7,7 +7,8 @@ U-Net (random weights: its time does not depend on them) in the same harness; th
 Visibility: 131,072 points in the box of a capture's cameras (its real, distorted lenses): every camera's exact test,
 the way of nerfstudio's published visibility field (pinholes, float32, 50 cameras at a time in one batched matrix
 product; our own writing of it), and ours with and without the cells that settle most points. Filling: holes torn into
-a room (``regularizer_fill.py``). Writes docs/results/regularizer.json.
+a room (``regularizer_fill.py``). What a step of our own field's training costs with it, on the capture's photos
+(``regularizer_overhead.py``). Writes docs/results/regularizer.json.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from fit_cache import say
 from grid_field import GridField
 from numpy.typing import NDArray
 from regularizer_fill import fill_row
+from regularizer_overhead import overhead_rows
 from timing import median_seconds
 
 from unghost import load_denoiser
@@ -158,6 +160,7 @@ def main() -> None:
     torch.set_num_threads(options.threads)
     rows = [*visibility_rows(options), *step_rows(options)]
     rows += [fill_row(name, steps=options.fill_steps) for name in shipped_names()]
+    rows += overhead_rows(options.capture, "default", threads=options.threads)
     command = f"python benchmarks/regularizer.py {options.capture.resolve().name}"
     write_results(
         options.out / "regularizer.json", build_results(rows, command=command, seeds=[0], threads=options.threads)

@@ -8,6 +8,7 @@ Prints the table of ``docs/stability.md``; every row checks the behaviour that i
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -22,11 +23,12 @@ from unghost.regularizer.clean import clean
 from unghost.regularizer.losses import dsds_loss, stable_mean
 from unghost.regularizer.regularizer import DensityRegularizer
 from unghost.regularizer.rivals import free_space_loss, sparsity_loss, squash_density, total_variation_loss
+from unghost.regularizer.settings import RegularizerSettings
 from unghost.regularizer.visibility import ViewCounter
 
 BOX = np.array([[-1.0] * 3, [1.0] * 3])
 PITCH = 0.0625
-TARGET = -math.log1p(-0.1)
+TARGET = RegularizerSettings().target_density()
 LARGEST = float(np.finfo(np.float32).max)
 
 
@@ -98,6 +100,13 @@ def raises(value: float) -> None:
     dropping = build(None, drop_invalid=True)
     assert torch.isfinite(dropping(field)["dsds"])
     assert dropping.report["dropped"] > 0
+
+
+def warns(level: torch.Tensor, text: str) -> None:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        build(0.0)(lambda positions: level.expand(len(positions)))
+    assert any(text in str(warning.message) for warning in caught)
 
 
 def smooth(p: Any) -> Any:
@@ -233,6 +242,10 @@ CASES = [
          lambda: raises(math.nan)),
     Case("density inf", "the same", lambda: raises(math.inf)),
     Case("density −1", "the same", lambda: raises(-1.0)),
+    Case("the same density at every place of the box", "`UserWarning`, once: does the callable use its positions?",
+         lambda: warns(torch.tensor(2.0, requires_grad=True), "does it use its positions")),
+    Case("densities without a gradient where one is wanted", "`UserWarning`, once: detached, frozen, under `no_grad`?",
+         lambda: warns(torch.tensor(2.0), "without a gradient")),
     Case("float32 densities of a smooth field", FINITE, lambda: precision(torch.float32)),
     Case("float16 densities", "upcast to float32; the error is the rounding of the densities themselves",
          lambda: precision(torch.float16)),
@@ -276,4 +289,5 @@ def table(cases: list[Case]) -> list[str]:
 
 
 if __name__ == "__main__":
+    warnings.filterwarnings("ignore", message=".*density_fn returned")  # constant fields, on purpose
     print("\n".join(table(CASES)))

@@ -10,6 +10,7 @@ All functions take numpy arrays and torch tensors alike and return the same kind
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -126,6 +127,15 @@ def check_density(density: Array, positions: Array, *, caller: str) -> None:
     raise ValueError(
         f"{caller}: densities must be finite and >= 0, got {found} of {values.size}; first {values[where]} at {place}"
     )
+
+
+def warn_if_constant(lowest: float, highest: float, count: int, *, caller: str) -> None:
+    """Warn if a density function gave one and the same density, other than 0, at ``count`` places of the box."""
+    if count > 1 and lowest == highest > 0:
+        warnings.warn(
+            f"{caller}: density_fn returned {lowest:g} at each of {count} places: does it use its positions?",
+            stacklevel=3,
+        )
 
 
 def check_density_shape(density: Any, positions: Array, *, caller: str) -> Array:

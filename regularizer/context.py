@@ -27,6 +27,7 @@ from ..core.shards import SURROUNDINGS_RESOLUTION, TRANSMITTANCE_RESOLUTION
 from ..core.transmittance import DensityFn, TransmittanceMaps
 
 FloatGrid = NDArray[np.float32]
+FloatArray = NDArray[np.float64]
 Corner = tuple[int, ...]
 
 POINTS = POOLED * SURROUNDINGS_RESOLUTION  # along an axis of the surroundings: every third cell of the grid
@@ -40,10 +41,12 @@ def viewing_cameras(cameras: Cameras | None, names: Sequence[str]) -> Cameras | 
     return pinholes(cameras)
 
 
-def view_channel(cameras: Cameras, centers: NDArray[np.float64], edges: NDArray[np.float64]) -> FloatGrid:
-    """The channel ``view_count`` of axis-aligned cubes ``(N, 3)``, ``(N,)``: ``(N, 32, 32, 32)``."""
-    upright = np.broadcast_to(np.eye(3), (len(centers), 3, 3))
-    return encode_view_count(count_views(cameras, centers, edges, upright))
+def view_channel(
+    cameras: Cameras, centers: FloatArray, edges: FloatArray, rotations: FloatArray | None = None
+) -> FloatGrid:
+    """The channel ``view_count`` of cubes ``(N, 3)``, ``(N,)``, ``(N, 3, 3)`` or axis-aligned: ``(N, 32, 32, 32)``."""
+    turned = np.broadcast_to(np.eye(3), (len(centers), 3, 3)) if rotations is None else rotations
+    return encode_view_count(count_views(cameras, centers, edges, turned))
 
 
 def light_maps(
@@ -71,9 +74,12 @@ def light_maps(
     return TransmittanceMaps.build(inside, cameras, aabb=aabb, field_pitch=pitch)
 
 
-def light_channel(maps: TransmittanceMaps, centers: NDArray[np.float64], edges: NDArray[np.float64]) -> FloatGrid:
-    """The channel ``transmittance`` of axis-aligned cubes ``(N, 3)``, ``(N,)``: ``(N, 16, 16, 16)``."""
-    lattice = cube_lattices(centers, edges, None, resolution=TRANSMITTANCE_RESOLUTION)
+def light_channel(
+    maps: TransmittanceMaps, centers: FloatArray, edges: FloatArray, rotations: FloatArray | None = None
+) -> FloatGrid:
+    """The channel ``transmittance`` of cubes ``(N, 3)``, ``(N,)``, ``(N, 3, 3)`` or axis-aligned:
+    ``(N, 16, 16, 16)``."""
+    lattice = cube_lattices(centers, edges, rotations, resolution=TRANSMITTANCE_RESOLUTION)
     return encode_share(maps.best_view(lattice))
 
 

@@ -44,8 +44,8 @@ def cube_surroundings(
         aabb: ``(2, 3)``.
         rule, soft: how the cubes themselves are encoded, over the same pitch.
     """
-    some, device = asked.cpu().numpy(), cubes.pitch.device
-    lattice = surroundings_lattice(cubes.centers[some], cubes.edges[some])
+    device = cubes.pitch.device
+    lattice = surroundings_lattice(*cubes.frames(asked))
     inside = torch.from_numpy(contains(aabb, lattice)).to(device)
     positions = torch.as_tensor(lattice, dtype=torch.float32, device=device)[inside]
     pitch = cubes.pitch[asked].expand(inside.shape)[inside]
@@ -105,11 +105,11 @@ def complete_channels(
     Returns:
         ``(n, C, R, R, R)``, where ``signed`` is.
     """
-    some, known = asked.cpu().numpy(), {}
+    frames, known = cubes.frames(asked), {}
     if viewing is not None:
-        known[VIEW_COUNT] = view_channel(viewing, cubes.centers[some], cubes.edges[some])
+        known[VIEW_COUNT] = view_channel(viewing, *frames)
     if maps is not None:
-        known[TRANSMITTANCE] = light_channel(maps, cubes.centers[some], cubes.edges[some])
+        known[TRANSMITTANCE] = light_channel(maps, *frames)
     if SURROUNDINGS in names:
         known[SURROUNDINGS] = encode_surroundings(surroundings())
     nothing = np.broadcast_to(np.float32(EMPTY), (len(signed), *signed.shape[2:]))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -21,7 +21,7 @@ from ..core.aabb import as_aabb, scene_extent
 from ..core.arrays import to_numpy
 from ..core.cameras import Cameras, warn_if_turned_away
 from ..core.manifest import Denoiser
-from ..core.occupancy import DECISION, EMPTY, check_density, check_density_shape, opacity_from_density
+from ..core.occupancy import DECISION, EMPTY, opacity_from_density, warn_if_constant
 from ..core.schedule import check_timestep
 from .context import viewing_cameras
 from .cube_context import FollowedRays, complete_channels, cube_surroundings
@@ -31,9 +31,8 @@ from .losses import cube_parts, cubewise_mean, dsds_loss, stable_mean, upcast, v
 from .proposals import ImportanceGrid
 from .queries import field_device
 from .settings import RegularizerSettings
+from .tensor_queries import DensityFn, query_tensors
 from .visibility import ViewCounter, grow_box, visibility_points
-
-DensityFn = Callable[[Any], Any]
 
 NOMINAL_CELLS = 128  # a field whose pitch is unknown is taken to have this many cells along the longest side
 POINTS_PER_CELL = 4  # asked of the field to fill the importance grid at the first call
@@ -191,23 +190,11 @@ class DensityRegularizer:
 
     def _query(self, field: DensityFn, positions: Tensor) -> tuple[Tensor, Tensor]:
         """Densities ``(M,)`` at ``(M, 3)``, in chunks, and which of them are valid (all, unless dropping)."""
-        if len(positions) == 0:
-            return positions.new_zeros(0), torch.ones(0, dtype=torch.bool, device=positions.device)
-        parts = []
-        for part in torch.split(positions, self.settings.chunk):
-            density = field(part)
-            if not isinstance(density, Tensor):
-                raise TypeError(
-                    f"DensityRegularizer: density_fn must return a torch tensor, got {type(density).__name__}"
-                )
-            parts.append(upcast(check_density_shape(density, part, caller="DensityRegularizer")))
-        values = torch.cat(parts)
-        if not self.settings.drop_invalid:
-            check_density(values.detach(), positions, caller="DensityRegularizer")
-            return values, torch.ones_like(values, dtype=torch.bool)
-        valid = torch.isfinite(values.detach()) & (values.detach() >= 0)
+        values, valid = query_tensors(
+            field, positions, chunk=self.settings.chunk, drop_invalid=self.settings.drop_invalid
+        )
         self.report["dropped"] += int((~valid).sum())
-        return torch.where(valid, values, torch.zeros_like(values)), valid
+        return values, valid
 
     def _bootstrap(self, field: DensityFn, device: torch.device) -> None:
         """Fill a grid that has seen nothing by asking the field in every cell."""
@@ -216,6 +203,8 @@ class DensityRegularizer:
         with torch.no_grad():
             density, valid = self._query(field, positions)
         self._refresh(positions[valid], density[valid], self._nominal_pitch())
+        lowest, highest = (float(value) for value in torch.aminmax(density))
+        warn_if_constant(lowest, highest, len(density), caller="DensityRegularizer")
 
     def _refresh(self, positions: Tensor, density: Tensor, pitch: Tensor | float) -> None:
         """Opacities (or, under the density rule, densities) into the grid."""

@@ -27,6 +27,7 @@ class RegularizerSettings:
         every: calls from one that does something to the next; those between cost nothing and return zeros.
         edge_range: lowest and highest cube edge as fractions of the scene extent; None: .5-1.25 field cells a
             voxel where ``field_pitch`` is known, else the paper's .01-.1.
+        rotate: turn every cube at random (uniform on SO(3)); False keeps the scene's axes.
         strategy: ``"mixed"``, ``"importance"`` or ``"uniform"`` cube centres.
         uniform_share: of the mixed strategy, in [0, 1].
         timestep: for the denoiser; None for its default, or a function of the step.
@@ -54,6 +55,7 @@ class RegularizerSettings:
     cubes: int = 40
     every: int = 1
     edge_range: tuple[float, float] | None = None
+    rotate: bool = False
     strategy: Strategy = "mixed"
     uniform_share: float = 0.25
     timestep: Timestep = None

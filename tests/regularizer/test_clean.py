@@ -141,6 +141,11 @@ def test_nothing_at_all_and_everything_full(kit):
             json.dumps(mask.summary())
 
 
+def test_a_callable_that_does_not_look_at_its_positions_is_pointed_out(kit):
+    with pytest.warns(UserWarning, match="clean: density_fn returned 4 at each of 4000 places"):
+        clean(lambda p: np.full(len(p), 4.0), BOX, denoiser=kit.numpy_denoiser(kit.identity), resolution=20)
+
+
 def test_keep_boxes_are_left_alone(kit):
     box = [[-1.0, -1.0, 0.3], [1.0, 1.0, 0.5]]
     mask = clean(room_density, BOX, denoiser=kit.numpy_denoiser(kit.all_empty), field_pitch=PITCH, keep_boxes=(box,))

@@ -164,8 +164,9 @@ def build(kit, aabb, names, cameras=None, **options):
     return DensityRegularizer(denoiser, aabb=aabb, cameras=cameras, **settings), denoiser
 
 
-def test_the_regularizer_tells_all_it_knows(kit, aabb, crowd):
-    regularizer, denoiser = build(kit, aabb, CHANNEL_NAMES, crowd)
+@pytest.mark.parametrize("rotate", [False, True])
+def test_the_regularizer_tells_all_it_knows(kit, aabb, crowd, rotate):
+    regularizer, denoiser = build(kit, aabb, CHANNEL_NAMES, crowd, rotate=rotate)
     regularizer.observe(unit_lattice(8) * 1.9, np.ones((8, 8, 8)))
     cubes = draw_cubes(
         regularizer.grid, regularizer._rng(0), regularizer.settings, field_pitch=PITCH, resolution=32,
@@ -174,11 +175,12 @@ def test_the_regularizer_tells_all_it_knows(kit, aabb, crowd):
     regularizer(waves_of_tensors)
     given = denoiser.calls[0][0]
     assert given.shape == (5, len(CHANNEL_NAMES), 32, 32, 32)
-    upright = np.broadcast_to(np.eye(3), (5, 3, 3))
-    np.testing.assert_array_equal(
-        given[:, 2], encode_view_count(count_views(crowd, cubes.centers, cubes.edges, upright))
-    )
-    expected = surroundings(lambda p: waves(p), cubes.centers, cubes.edges, upright, np.full(5, PITCH), aabb)
+    turns = cubes.rotations if rotate else np.broadcast_to(np.eye(3), (5, 3, 3))
+    np.testing.assert_array_equal(given[:, 2], encode_view_count(count_views(crowd, cubes.centers, cubes.edges, turns)))
+    shown = torch.from_numpy(waves(cubes.positions.numpy()) * PITCH)
+    told = torch.where(cubes.inside, 1 - 2 * torch.exp(-shown), -1.0)
+    np.testing.assert_allclose(given[:, 0], told, atol=1e-5)
+    expected = surroundings(lambda p: waves(p), cubes.centers, cubes.edges, turns, np.full(5, PITCH), aabb)
     np.testing.assert_allclose(coarse_channel(given[:, 1]), encode_surroundings(expected), atol=1e-5)
     assert expected.std() > 0.1
 

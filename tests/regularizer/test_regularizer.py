@@ -1,4 +1,5 @@
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -419,3 +420,27 @@ def test_nothing_is_written_to_the_field(kit, aabb, lone_camera):
     regularizer(field)
     assert torch.equal(before, field.values.detach())
     assert field.values.grad is None
+
+
+def test_densities_without_a_gradient_are_pointed_out(kit, aabb):
+    field = kit.field(torch.rand(4, 4, 4) * 5)
+    regularizer, _ = build(kit, aabb, kit.identity)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        regularizer(field)
+        with torch.no_grad():  # nobody wants a gradient
+            regularizer(field)
+    with pytest.warns(UserWarning, match="densities without a gradient.*detached, frozen, or under no_grad"):
+        regularizer(lambda positions: field(positions).detach())
+
+
+def test_a_callable_that_does_not_look_at_its_positions_is_pointed_out(kit, aabb):
+    level = torch.tensor(3.0, requires_grad=True)
+    regularizer, _ = build(kit, aabb, kit.identity)
+    with pytest.warns(UserWarning, match="DensityRegularizer: density_fn returned 3 at each of 32000 places"):
+        regularizer(lambda positions: level.expand(len(positions)))
+    nothing = torch.tensor(0.0, requires_grad=True)  # an empty field is one
+    regularizer, _ = build(kit, aabb, kit.identity)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        regularizer(lambda positions: nothing.expand(len(positions)))

@@ -1,0 +1,54 @@
+"""Asking a differentiable density callable, in bounded chunks, and saying what is wrong with its answer (torch)."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..core.occupancy import check_density, check_density_shape
+from .losses import upcast
+
+DensityFn = Callable[[Any], Any]
+
+WITHOUT_GRADIENT = (
+    "DensityRegularizer: density_fn returned densities without a gradient, so that the losses cannot change the field: "
+    "is it detached, frozen, or under no_grad?"
+)
+
+
+def query_tensors(field: DensityFn, positions: Tensor, *, chunk: int, drop_invalid: bool) -> tuple[Tensor, Tensor]:
+    """Densities ``(M,)`` at ``positions (M, 3)``, at least float32, and which of them are valid.
+
+    Args:
+        field: positions to densities ``(M, 1)`` or ``(M,)``.
+        positions: float32.
+        chunk: most positions a call.
+        drop_invalid: put 0 for what is NaN, infinite or negative, and call it invalid, instead of raising.
+
+    Raises:
+        TypeError: no tensor of floating-point numbers.
+        ValueError: of another shape; or NaN, infinite or negative, unless dropping.
+
+    Warns:
+        UserWarning: gradients are wanted, and the densities have none.
+    """
+    if len(positions) == 0:
+        return positions.new_zeros(0), torch.ones(0, dtype=torch.bool, device=positions.device)
+    parts = []
+    for part in torch.split(positions, chunk):
+        density = field(part)
+        if not isinstance(density, Tensor):
+            raise TypeError(f"DensityRegularizer: density_fn must return a torch tensor, got {type(density).__name__}")
+        parts.append(upcast(check_density_shape(density, part, caller="DensityRegularizer")))
+    values = torch.cat(parts)
+    if torch.is_grad_enabled() and not values.requires_grad:
+        warnings.warn(WITHOUT_GRADIENT, stacklevel=2)
+    if not drop_invalid:
+        check_density(values.detach(), positions, caller="DensityRegularizer")
+        return values, torch.ones_like(values, dtype=torch.bool)
+    valid = torch.isfinite(values.detach()) & (values.detach() >= 0)
+    return torch.where(valid, values, torch.zeros_like(values)), valid
