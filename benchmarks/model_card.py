@@ -22,13 +22,7 @@ from unghost.prior.network import SIZES, RestorationNet, parameter_count
 
 WEIGHTS = ROOT / "unghost" / "weights"
 CALLED = {"default": "unghost"}  # in the reference measurement
-# Models that others started from and whose own provenance is of another form: by their hash, where git has them and the
-# card that was written by hand when they were shipped.
-EARLIER = {
-    "7a5e2ae695f9a3aa639a75ab5b618fbba2b8c48062023e77fbebc1094920a53f": (
-        "0173c93:unghost/weights/default.safetensors", "f294099:unghost/weights/M.md",
-    ),
-}  # fmt: skip
+OLDER = ("m",)  # its provenance is of another form; its card was written when it was shipped
 DATA = """unghost curate procedural --out out/procedural --n 64000 --seed 0 --workers 2
 unghost curate meshes --out out/meshes --n 40000 --seed 0 --workers 2 --mesh-root MESHES
 unghost harvest --out out/rooms --scenes 80 --first 4 --seed 1000 --cubes 112 --no-fit --workers 2 --mesh-root MESHES
@@ -60,8 +54,9 @@ SEEN_GHOSTS = (
 
 
 def models() -> list[tuple[str, Path, Manifest]]:
-    """Name, ONNX file and manifest of what is shipped."""
-    return [(path.stem, path, read_manifest(path)) for path in sorted(WEIGHTS.glob("*.onnx"))]
+    """Name, ONNX file and manifest of what is shipped and has its card from here."""
+    files = [path for path in sorted(WEIGHTS.glob("*.onnx")) if path.stem not in OLDER]
+    return [(path.stem, path, read_manifest(path)) for path in files]
 
 
 def size_of(manifest: Manifest) -> str:
@@ -82,14 +77,9 @@ def sources(shards: Iterable[dict[str, Any]]) -> list[list[str]]:
 
 
 def stages(training: dict[str, Any]) -> list[dict[str, Any]]:
-    """The runs that led to a model, the first one first; those before one of ``EARLIER`` are told by its card."""
-    before = training.get("started_from")
-    return [*(stages(before) if before and before["sha256"] not in EARLIER else []), training]
-
-
-def earlier(manifest: Manifest) -> tuple[str, str] | None:
-    """Where git has the model that the first of the ``stages`` started from, and its card."""
-    return EARLIER.get((stages(manifest.training)[0].get("started_from") or {}).get("sha256", ""))
+    """The runs that led to a model, the first one first."""
+    earlier = training.get("started_from")
+    return [*(stages(earlier) if earlier else []), training]
 
 
 def run_folder(manifest: Manifest, number: int) -> str:
@@ -99,9 +89,8 @@ def run_folder(manifest: Manifest, number: int) -> str:
 
 def train_commands(manifest: Manifest) -> list[str]:
     """What trained it, up to the folders' places; a command a stage."""
-    every, before = stages(manifest.training), earlier(manifest)
-    given = f"out/{manifest.name}-before.safetensors"
-    commands = [f"git show {before[0]} > {given}"] if before else []
+    commands = []
+    every = stages(manifest.training)
     for index, stage in enumerate(every):
         shards = " ".join(f"out/{source}={share}" for source, _, _, share in sources(stage["shards"]))
         later = [
@@ -112,7 +101,6 @@ def train_commands(manifest: Manifest) -> list[str]:
         seen = f" --channels {' '.join(channels)} --drop-channels {dropped:g}" if len(channels) > 1 else ""
         online = "".join(f" --online {part['name']}={part['share']:g}" for part in stage.get("online", []))
         start = f" --init-from {run_folder(manifest, index - 1)}/model.safetensors" if index else ""
-        start = f" --init-from {given}" if before and not index else start
         commands.append(
             f"unghost train {shards} \\\n  --out {run_folder(manifest, index)} --size {size_of(manifest)} --steps "
             f"{stage['steps']} --batch-size {stage['batch_size']} --learning-rate {stage['learning_rate']:g} "
@@ -139,8 +127,6 @@ def section(name: str, path: Path, manifest: Manifest) -> list[str]:
     folder = run_folder(manifest, len(stages(training)) - 1)
     command = chosen["command"].replace("ship.py ", f"ship.py {folder}/")
     half = " Its weights are stored in half precision." if precision_of(manifest) == "fp16" else ""
-    before = earlier(manifest)
-    start = f"From an earlier model of ours (its card: `git show {before[1]}`)" if before else "From random weights"
     return [
         f"`{manifest.name}`, size {size_of(manifest).upper()}: {manifest.parameters} parameters, "
         f"{training['gflop']:.2f} GFLOP a cube. It sees {', '.join(manifest.channels)}.{half} Default timestep "
@@ -148,7 +134,7 @@ def section(name: str, path: Path, manifest: Manifest) -> list[str]:
         f"those tried at which it keeps {chosen['kept']:g} of the surface of rooms made for that "
         f"(docs/results/threshold_{name}.json). DSDS decides at 0 unless told otherwise.", "",
         *table(("file", "size", "sha256"), files), "",
-        f"{start}: {' and then '.join(map(told, stages(training)))}, on two CPU cores "
+        f"From random weights: {' and then '.join(map(told, stages(training)))}, on two CPU cores "
         f"({training['precision']}), torch {training['torch']}. In harvested cubes, voxels that are opaque and true "
         f"surface weigh {training['keep_weight']:g} times.", "",
         *table(("source", "shards", "cubes", "share of the stream"), sources(training["shards"])), "",

@@ -84,7 +84,7 @@ def denoise(results: dict[str, Any]) -> list[str]:
             "threshold for all cubes of a set:", "",
             *table(["method", *(FOG[name] for name in foggy)], lines), "",
             *(f"{line}\n" for line in (_beaten(found, name, shown) for name in foggy) if line),
-            "`unghost` is the default, `m` a larger and `xs` a smaller one; `views` is told who looks where, "
+            "`unghost` is the default, `m` an older, larger and `xs` a smaller one; `views` is told who looks where, "
             "and blind it is not. The diffusions are compact ones after short training ([the prior](docs/prior.md)), "
             "shown at timestep 50; at 10 and 100 they are in docs/results/denoise.json.", "",
         ]  # fmt: skip

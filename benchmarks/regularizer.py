@@ -43,6 +43,7 @@ from unghost.regularizer.visibility import ViewCounter
 
 ROOT = Path(__file__).resolve().parents[1]
 POINTS = 131_072
+FILLING = ("default", "views")
 UNET = "the paper's U-Net"
 
 
@@ -159,7 +160,7 @@ def main() -> None:
     options = tyro.cli(Options, description=__doc__)
     torch.set_num_threads(options.threads)
     rows = [*visibility_rows(options), *step_rows(options)]
-    rows += [fill_row(name, steps=options.fill_steps) for name in shipped_names()]
+    rows += [fill_row(name, steps=options.fill_steps, target=target) for target in (None, 0.9) for name in FILLING]
     rows += overhead_rows(options.capture, "default", threads=options.threads)
     command = f"python benchmarks/regularizer.py {options.capture.resolve().name}"
     write_results(

@@ -34,13 +34,14 @@ def torn(seed: int) -> tuple[Room, Mask, Mask]:
     return room, solid, missing
 
 
-def fill_row(name: str, *, steps: int, seed: int = ROOM) -> dict[str, Any]:
-    """``steps`` of Adam on the DSDS loss with default settings, beside a term that holds every cell outside the holes
-    to its opacity, as photos of them would."""
+def fill_row(name: str, *, steps: int, target: float | None = None, seed: int = ROOM) -> dict[str, Any]:
+    """``steps`` of Adam on the DSDS loss with default settings but ``target``, beside a term that holds every cell
+    outside the holes to its opacity, as photos of them would."""
     room, solid, missing = torn(seed)
     field = GridField(np.where(missing, 0.0, room.true_density), room.pitch)
     seen, start = torch.from_numpy(~missing), 1.0 - torch.exp(-field.cells().detach() * room.pitch)
-    regularizer = DensityRegularizer(load_denoiser(name, backend="onnx"), aabb=AABB, field_pitch=room.pitch)
+    denoiser = load_denoiser(name, backend="onnx")
+    regularizer = DensityRegularizer(denoiser, aabb=AABB, field_pitch=room.pitch, target=target)
     optimizer = torch.optim.Adam(field.parameters(), lr=0.1)
     for _ in range(steps):
         optimizer.zero_grad()
@@ -49,7 +50,8 @@ def fill_row(name: str, *, steps: int, seed: int = ROOM) -> dict[str, Any]:
         optimizer.step()
     found = np.asarray(RULE.occupied(field.cells().detach().numpy(), room.pitch))
     row = {
-        "method": f"filling, {name}", "steps": steps, "holes": HOLES, "cells_missing": int((solid & missing).sum()),
+        "method": f"filling, {name}", "target": target or RULE.threshold, "steps": steps,
+        "holes": HOLES, "cells_missing": int((solid & missing).sum()),
         "holes_filled": float(found[solid & missing].mean()), "surface_kept": float(found[solid & ~missing].mean()),
         "cells_added": float((found & ~room.surface(RULE)).sum() / solid.sum()),
     }  # fmt: skip

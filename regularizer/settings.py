@@ -14,9 +14,6 @@ from .visibility import PointKind
 
 Timestep = int | Callable[[int], int] | None
 
-# At the threshold itself a filled voxel would never count as occupied: nothing beside it could grow from there.
-FILLED_OPACITY = 0.9
-
 
 @dataclass(frozen=True)
 class RegularizerSettings:
@@ -34,7 +31,8 @@ class RegularizerSettings:
         threshold: ``x0_pred`` below it is pushed out (0: the paper); None for what the manifest advises ``clean``.
         fill_threshold: ``x0_pred`` at or above it is filled; None for 0 (the paper) or ``threshold`` if higher.
         target: ``w`` of eq. 2, up to which it is filled: an opacity of a field cell in (0, 1), or a density > 0 under
-            the density rule, at or above the rule's threshold. None for .9, under the density rule for its threshold.
+            the density rule, at or above the rule's threshold. None for that threshold: then hardly anything is filled,
+            as what is filled never counts as occupied. With .9 holes close (and fog may set).
         dsds_weight, visibility_weight: factors of the losses; 0 switches one off, its queries too. Under the
             opacity rule the losses are optical depths per cell, so the weights do not depend on the scene's unit.
         visibility_samples: points a step for the visibility loss.
@@ -114,10 +112,8 @@ class RegularizerSettings:
 
     def target_density(self) -> float:
         """``w`` as the loss takes it: an optical depth of a cell, under the density rule a density."""
-        if self.rule.kind == "density":
-            return self.rule.threshold if self.target is None else self.target
-        opacity = max(FILLED_OPACITY, self.rule.threshold) if self.target is None else self.target
-        return -math.log1p(-opacity)
+        target = self.rule.threshold if self.target is None else self.target
+        return target if self.rule.kind == "density" else -math.log1p(-target)
 
 
 def _is_range(edge_range: tuple[float, float]) -> bool:

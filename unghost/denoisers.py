@@ -44,8 +44,8 @@ def load_denoiser(
     """Load the shipped denoiser, or one of your own.
 
     Args:
-        name_or_path: a shipped name (``"default"``; ``"views"``, which takes view counts too; ``"m"``, a
-            larger and ``"xs"``, a smaller one), or the path of an ``.onnx`` or ``.safetensors`` file.
+        name_or_path: a shipped name (``"default"``; ``"views"``, which takes view counts too; ``"m"``, an
+            older and larger one; ``"xs"``, a smaller one), or the path of an ``.onnx`` or ``.safetensors`` file.
         backend: ``"onnx"`` (numpy arrays in and out; no torch) or ``"torch"`` (tensors). None takes what
             the file's ending says, and ``"onnx"`` for a shipped name.
         threads: of onnxruntime; None leaves the choice to it.

@@ -66,14 +66,14 @@ def test_filling_by_hand(kit, aabb):
 @pytest.mark.parametrize(
     ("settings", "expected"),
     [
-        ({}, -math.log(0.1)),
+        ({}, -math.log(0.9)),
         ({"rule": OccupancyRule("opacity", 0.95)}, -math.log(0.05)),
         ({"target": 0.5}, math.log(2)),
         ({"rule": OccupancyRule.paper()}, 0.01),
         ({"rule": OccupancyRule.paper(), "target": 20.0}, 20.0),
     ],
 )
-def test_what_is_filled_counts_as_occupied(settings, expected):
+def test_how_far_is_filled(settings, expected):
     found = RegularizerSettings(**settings)
     assert found.target_density() == pytest.approx(expected)
     assert found.target_density() >= found.rule.density_threshold(1.0)
