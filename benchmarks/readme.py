@@ -202,7 +202,11 @@ def verdict(rows: dict[str, Row]) -> str:
         if not method.startswith("dsds"):
             continue
         gain, name = rows[method]["psnr"] - rows["visibility"]["psnr"], method.replace("dsds", "DSDS")
-        said.append(f"{name} {'adds' if gain > 0 else '**loses**'} {abs(gain):.2f} dB to visibility alone.")
+        depth = [number(rows[of]["disparity_mae"]) for of in (method, "visibility")]
+        said.append(
+            f"{name} {'adds' if gain > 0 else '**loses**'} {abs(gain):.2f} dB to visibility alone; its disparity "
+            f"error is {depth[0]}, that of visibility alone {depth[1]}."
+        )
     return " ".join(said)
 
 
