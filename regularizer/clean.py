@@ -257,7 +257,7 @@ def _survey(
     xs, ys, zs = (origin[axis] + (np.arange(shape[axis]) + 0.5) * pitch for axis in range(3))
     signed = np.full(shape, EMPTY, dtype=np.float32)
     occupied, judged, protected = np.zeros(shape, bool), np.zeros(shape, bool), np.zeros(shape, bool)
-    dropped, found = 0, [np.inf, -np.inf]
+    dropped, lowest, highest = 0, math.inf, -math.inf
     rows = max(1, s.chunk // (shape[1] * shape[2]))
     for start in range(0, shape[0], rows):
         part = slice(start, start + rows)
@@ -270,7 +270,7 @@ def _survey(
             values = np.where(invalid, 0.0, values)
         else:
             check_density(values, places, caller="clean")
-        found = [min(found[0], values.min(initial=np.inf)), max(found[1], values.max(initial=-np.inf))]
+        lowest, highest = min(lowest, values.min(initial=math.inf)), max(highest, values.max(initial=-math.inf))
         density = np.zeros(inside.shape)
         density[inside] = values
         signed[part] = s.rule.encode(density, opaque_pitch, soft=s.soft)
@@ -278,7 +278,7 @@ def _survey(
         judged[part] = faint_rule.occupied(density, opaque_pitch)
         for box in s.keep_boxes:
             protected[part] |= ((positions >= box[0]) & (positions <= box[1])).all(axis=-1)
-    warn_if_constant(*found, math.prod(shape), caller="clean")
+    warn_if_constant(lowest, highest, math.prod(shape), caller="clean")
     return _Survey(signed, occupied, judged | occupied, protected, dropped)
 
 
