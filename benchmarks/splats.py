@@ -140,7 +140,7 @@ def radius(gaussians: Gaussians) -> Mask:
 
 def indexed(gaussians: Gaussians, kept: Any) -> Mask:
     mask = np.zeros(len(gaussians), dtype=bool)
-    mask[np.asarray(kept)] = True
+    mask[np.asarray(kept, dtype=np.int64)] = True  # a list, which may be empty
     return mask
 
 
