@@ -67,7 +67,7 @@ class Options:
         out: where dsds_rooms.json goes.
     """
 
-    rooms: tuple[int, ...] = (0, 1, 3, 4)
+    rooms: tuple[int, ...] = (1, 3, 4, 5)
     seed: int = 777
     resolution: int = 96
     fit_steps: int = 450
@@ -100,10 +100,12 @@ class FittedRoom:
         self.labels = truth.labels(self.points[None], self.field.field_pitch, opaque[None], nothing)[0]
 
     def failed(self) -> bool:
-        """Whether hardly any of the surface is opaque, or there is no ghost: then there is nothing to score."""
+        """Whether hardly any of the surface is opaque, or no ghost is, or nobody else looks: nothing to score."""
         opaque, surface = self.before > RULE.threshold, self.labels == SURFACE_LABEL
         ghosts = opaque & (self.labels == FREE_LABEL)
-        return int((opaque & surface).sum()) < FEWEST * max(int(surface.sum()), 1) or not ghosts.any()
+        return int((opaque & surface).sum()) < FEWEST * max(int(surface.sum()), 1) or not (
+            ghosts.any() and len(self.others[0])
+        )
 
     def opacity(self, field: Any) -> NDArray[np.float64]:
         """Of a cell at each of the points."""
@@ -167,7 +169,7 @@ def main() -> None:
     for index in options.rooms:
         room = FittedRoom(index, options)
         if room.failed():
-            say(f"room {index}: its fit failed, it is left out")
+            say(f"room {index}: nothing to score (its fit failed, or no other sweep fits in), it is left out")
             continue
         found["the field"].append({"room": index, **room.scores(room.field)})
         for way, settings in WAYS.items():
@@ -177,7 +179,7 @@ def main() -> None:
             )
             say(f"room {index}, {way}: " + " ".join(f"{k} {v:.3f}" for k, v in found[way][-1].items() if k != "room"))
     if not found["the field"]:
-        raise SystemExit("dsds_rooms: the fit of every room failed; give more --fit-steps, or other --rooms")
+        raise SystemExit("dsds_rooms: no room is left; give more --fit-steps, or other --rooms")
     rows = [
         {"method": way, **{k: float(np.mean([one[k] for one in each])) for k in each[0] if k != "room"}, "rooms": each}
         for way, each in found.items()
