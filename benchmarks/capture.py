@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 import tyro
-from fit_cache import FitCache, Plan, code_hash, file_hash, say
+from fit_cache import FitCache, Plan, code_hash, file_hash, say, training_hooks
 from numpy.typing import NDArray
 
 import unghost.fields
@@ -165,10 +165,7 @@ def fine_tune(
         regularizer = DensityRegularizer(
             denoiser, aabb=field.aabb, cameras=train.cameras, field_pitch=field.field_pitch, seed=seed, **overrides
         )
-        hooks = {
-            "regularizer": lambda tuned, step: sum(regularizer(tuned.density_fn).values()),
-            "observer": regularizer.observe,
-        }
+        hooks = training_hooks(regularizer)
     record = train_field(
         field, train.cameras, train.photos, steps=options.finetune_steps, seed=seed, fine_tune=True, progress=True,
         **hooks,

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 import torch
 import tyro
-from fit_cache import say
+from fit_cache import say, training_hooks
 from numpy.typing import NDArray
 
 from unghost import load_denoiser
@@ -127,10 +127,7 @@ class FittedRoom:
                 cubes=self.cubes,
                 **chosen,
             )
-            hooks = {
-                "regularizer": lambda tuned, step: sum(regularizer(tuned.density_fn).values()),
-                "observer": regularizer.observe,
-            }
+            hooks = training_hooks(regularizer)
         record = train_field(
             field, told.cameras, told.images, steps=steps, seed=self.index, config=self.fitting, fine_tune=True, **hooks
         )

@@ -26,6 +26,14 @@ def say(text: str) -> None:
     print(text, flush=True)
 
 
+def training_hooks(regularizer: Any) -> dict[str, Any]:
+    """What ``train_field`` is to be told of a :class:`DensityRegularizer`: its losses, and what it may observe."""
+    return {
+        "regularizer": lambda field, step: sum(regularizer(field.density_fn).values()),
+        "observer": regularizer.observe,
+    }
+
+
 def file_hash(path: str | Path) -> str:
     """SHA-256 of a file; ``unknown`` if there is none."""
     source = Path(path)

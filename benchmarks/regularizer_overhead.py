@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from fit_cache import say
+from fit_cache import say, training_hooks
 
 from unghost import load_denoiser
 from unghost.evaluation.captures import load_capture
@@ -41,10 +41,7 @@ def overhead_rows(
                 load_denoiser(name, backend="onnx", threads=threads), aabb=field.aabb, cameras=cameras,
                 field_pitch=field.field_pitch, **settings,
             )  # fmt: skip
-            hooks = {
-                "regularizer": lambda tuned, step, ask=regularizer: sum(ask(tuned.density_fn).values()),
-                "observer": regularizer.observe,
-            }
+            hooks = training_hooks(regularizer)
             regularizer(field.density_fn)  # what is built once is not counted
         record = train_field(field, cameras, photos, steps=steps, fine_tune=True, **hooks)
         seconds = record["seconds"] / record["steps"]

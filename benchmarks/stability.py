@@ -23,12 +23,11 @@ from unghost.regularizer.clean import clean
 from unghost.regularizer.losses import dsds_loss, stable_mean
 from unghost.regularizer.regularizer import DensityRegularizer
 from unghost.regularizer.rivals import free_space_loss, sparsity_loss, squash_density, total_variation_loss
-from unghost.regularizer.settings import RegularizerSettings
 from unghost.regularizer.visibility import ViewCounter
 
 BOX = np.array([[-1.0] * 3, [1.0] * 3])
 PITCH = 0.0625
-TARGET = RegularizerSettings().target_density()
+TARGET = -math.log1p(-0.1)  # by hand: where a cell becomes occupied, up to which is filled by default
 LARGEST = float(np.finfo(np.float32).max)
 
 

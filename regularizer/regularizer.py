@@ -276,6 +276,7 @@ class DensityRegularizer:
         s, asked, shown = self.settings, [], []
         for part in cube_parts(density):
             wide, pitch = widest(density[part]), cubes.pitch[part]
+            # occupied, told without an exponential
             asked.append((wide > s.rule.density_threshold(pitch)).flatten(1).any(dim=1) if s.skip_empty
                          else torch.ones(len(wide), dtype=torch.bool, device=density.device))  # fmt: skip
             if bool(asked[-1].any()):
