@@ -30,6 +30,7 @@ from unghost.splat_cleaning import box_of, clean_splats, pitch_of
 
 ROOT = Path(__file__).resolve().parents[1]
 KINDS = ("surface", "blob", "haze", "needle")
+REFERENCE = 40_000  # splats of a scene whose sizes are as written in `make`
 Mask = NDArray[np.bool_]
 
 
@@ -93,14 +94,19 @@ def facing(normals: NDArray[Any]) -> NDArray[Any]:
 
 
 def make(seed: int, options: Options) -> Scene:
-    """A furnished room in splats, with floaters in its free space."""
+    """A furnished room in splats, with floaters in its free space.
+
+    Whatever their number, the surface is covered as often (sizes go with its inverse square root), and floaters fill
+    the same share of the room (inverse cube root).
+    """
     rng = np.random.default_rng(seed)
     scene = random_scene(rng)
     ghosts = round(options.floaters * options.splats)
     true = options.splats - ghosts
+    flat, deep = (REFERENCE / options.splats) ** 0.5, (REFERENCE / options.splats) ** (1 / 3)
     means, normals = on_surfaces(rng, scene, true)
-    means = means + rng.normal(0, 0.002, means.shape)
-    side = rng.lognormal(np.log(0.012), 0.5, (true, 1))
+    means = means + rng.normal(0, 0.002 * flat, means.shape)
+    side = rng.lognormal(np.log(0.012 * flat), 0.5, (true, 1))
     extents = np.hstack([side, side * rng.uniform(0.4, 1.0, (true, 1)), side * rng.uniform(0.02, 0.15, (true, 1))])
     parts = [(means, extents, facing(normals), rng.normal(2.0, 1.5, true), np.zeros(true, int))]
     free = rng.uniform(-1.2, 1.2, (200_000, 3))
@@ -109,13 +115,13 @@ def make(seed: int, options: Options) -> Scene:
     turns = [rng.normal(size=(count, 4)) for count in each]
     places = free[rng.integers(0, len(free), 60)][rng.integers(0, 60, each[0])]
     blob = places + rng.normal(0, 0.025, places.shape)
-    parts.append((blob, rng.lognormal(np.log(0.012), 0.5, (each[0], 3)), turns[0], rng.normal(0, 1.5, each[0]),
+    parts.append((blob, rng.lognormal(np.log(0.012 * deep), 0.5, (each[0], 3)), turns[0], rng.normal(0, 1.5, each[0]),
                   np.full(each[0], 1)))  # fmt: skip
     haze = free[rng.integers(0, len(free), each[1])]
-    parts.append((haze, rng.lognormal(np.log(0.04), 0.4, (each[1], 3)), turns[1], rng.normal(-2.5, 0.8, each[1]),
+    parts.append((haze, rng.lognormal(np.log(0.04 * deep), 0.4, (each[1], 3)), turns[1], rng.normal(-2.5, 0.8, each[1]),
                   np.full(each[1], 2)))  # fmt: skip
     needle = free[rng.integers(0, len(free), each[2])]
-    thin = rng.lognormal(np.log(0.004), 0.3, (each[2], 3)) * [15, 1, 1]
+    thin = rng.lognormal(np.log(0.004 * deep), 0.3, (each[2], 3)) * [15, 1, 1]
     parts.append((needle, thin, turns[2], rng.normal(0, 1.5, each[2]), np.full(each[2], 3)))
     columns = [np.concatenate(column) for column in zip(*parts)]
     return Scene(Gaussians.create(*columns[:4]), columns[4])

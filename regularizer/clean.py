@@ -14,14 +14,15 @@ from numpy.typing import ArrayLike, NDArray
 from ..core.aabb import as_aabb, scene_extent
 from ..core.cameras import Cameras, warn_if_turned_away
 from ..core.manifest import Denoiser
-from ..core.occupancy import EMPTY, OccupancyRule, check_density, warn_if_constant
+from ..core.occupancy import OccupancyRule
 from ..core.schedule import check_timestep
 from ..core.transmittance import TransmittanceMaps
 from .context import GridContext, light_maps
 from .decide import decide, removed_regions
 from .denoise import check_denoiser
 from .keep_mask import KeepMask, lattice_origin
-from .queries import CHUNK, Backend, Query, make_query
+from .queries import CHUNK, Backend, make_query
+from .survey import Survey, survey_field
 from .windows import Progress, grow, shrink, vote
 
 Mask = NDArray[np.bool_]
@@ -51,7 +52,10 @@ class CleanSettings:
         speck: fewer connected cells than this, voted empty on something that stays, are kept.
         keep_boxes: ``(2, 3)`` boxes in which nothing is removed (thin or transparent things).
         skip_empty: do not send windows in which nothing is to be judged; never changes the mask.
-        drop_invalid: show NaN, infinite and negative densities as empty, leave their cells alone and count them,
+        probe: the field is first asked once a block of this many cells along each side, and everywhere only in blocks
+            that hold something and around those; 1 asks everywhere. What is thinner than a block and on its own may
+            then be missed: it stays.
+        drop_invalid: show NaN, infinite and negative densities as empty, leave their cells alone and count those met,
             instead of raising.
         backend: what the callable takes, ``"numpy"`` or ``"torch"``; None to find out.
         chunk: most positions handed to the callable at once.
@@ -71,6 +75,7 @@ class CleanSettings:
     fringe: int = 1
     keep_boxes: tuple[Any, ...] = ()
     skip_empty: bool = True
+    probe: int = 2
     drop_invalid: bool = False
     backend: Backend | None = None
     chunk: int = CHUNK
@@ -90,6 +95,7 @@ class CleanSettings:
             "smallest": (self.smallest >= 0, ">= 0"),
             "speck": (self.speck >= 0, ">= 0"),
             "fringe": (self.fringe >= 0, ">= 0"),
+            "probe": (self.probe >= 1, ">= 1"),
             "chunk": (self.chunk >= 1, ">= 1"),
         }
         for name, (holds, rule) in rules.items():
@@ -99,17 +105,6 @@ class CleanSettings:
             check_timestep(self.timestep, caller="clean")
         boxes = tuple(as_aabb(box, caller="clean: keep_boxes").tolist() for box in self.keep_boxes)
         object.__setattr__(self, "keep_boxes", boxes)
-
-
-@dataclass(frozen=True)
-class _Survey:
-    """The field on a grid, all ``(X, Y, Z)``: signed opacity, occupied cells, cells to judge, cells in the box."""
-
-    signed: FloatGrid
-    occupied: Mask
-    judged: Mask
-    protected: Mask
-    dropped: int
 
 
 def clean(
@@ -173,27 +168,30 @@ class Judgement:
     score: NDArray[np.float32]
     settings: CleanSettings
     advised: float
-    _survey: _Survey
+    _survey: Survey
     _about: dict[str, Any]
 
     def mask(self, strength: float | None = None) -> KeepMask:
         """The mask at a strength in [0, 1]; None for that of the settings."""
         s = self.settings if strength is None else dataclasses.replace(self.settings, strength=strength)
         survey, shape = self._survey, self.score.shape
-        threshold = threshold_of(s.strength, self.advised)
+        threshold, part = threshold_of(s.strength, self.advised), survey.extent()
         removed, faint = decide(
-            survey.occupied, survey.judged, self.score,
+            survey.occupied[part], survey.judged[part], self.score[part],
             threshold=threshold, smallest=s.smallest, speck=s.speck, fringe=s.fringe,
-        ) if s.strength > 0 else (np.zeros(shape, bool), np.zeros(shape, bool))  # fmt: skip
-        removed, faint = removed & ~survey.protected, faint & ~survey.protected
-        origin = lattice_origin(self.aabb, self.pitch, shape)
-        regions, region_count = removed_regions(removed, self.score, origin, self.pitch)
+        ) if s.strength > 0 else (np.zeros_like(survey.judged[part]),) * 2  # fmt: skip
+        removed, faint = removed & ~survey.protected[part], faint & ~survey.protected[part]
+        corner = [span.start * self.pitch for span in part]
+        origin = lattice_origin(self.aabb, self.pitch, shape) + corner
+        regions, region_count = removed_regions(removed, self.score[part], origin, self.pitch)
+        keep = np.ones(shape, dtype=bool)
+        keep[part] = ~(removed | faint)
         details = {
             "occupied": int(survey.occupied.sum()), "removed": int(removed.sum()), "faint_removed": int(faint.sum()),
-            "dropped": survey.dropped, "threshold": threshold, **self._about,
+            "asked": survey.asked, "dropped": survey.dropped, "threshold": threshold, **self._about,
             "settings": dataclasses.asdict(s), "region_count": region_count, "regions": regions,
         }  # fmt: skip
-        return KeepMask(self.aabb, self.pitch, ~(removed | faint), details)
+        return KeepMask(self.aabb, self.pitch, keep, details)
 
 
 def judge(
@@ -216,7 +214,10 @@ def judge(
     warn_if_turned_away(cameras, box, caller="clean")
     pitch, shape = grid_of(box, s)
     query = make_query(density_fn, place=box.mean(axis=0), backend=s.backend, chunk=s.chunk, caller="clean")
-    survey = _survey(query, box, pitch, shape, s)
+    survey = survey_field(
+        query, box, pitch, shape, rule=s.rule, faint=s.faint, opaque_pitch=s.field_pitch or pitch, soft=s.soft,
+        keep_boxes=s.keep_boxes, probe=s.probe, drop_invalid=s.drop_invalid, rows=s.chunk,
+    )  # fmt: skip
     maps = light_maps(denoiser.manifest.channels, cameras, query, aabb=box, pitch=s.field_pitch or pitch)
     score, windows = _score(survey, denoiser, s, box, pitch, cameras, maps, progress)
     about = {"windows": windows, "denoiser": denoiser.manifest.name}
@@ -247,43 +248,8 @@ def threshold_of(strength: float, advised: float) -> float:
     return advised + 2.0 * (strength - 0.5) * (1.0 + 1e-6 - advised)
 
 
-def _survey(
-    query: Query, aabb: NDArray[np.float64], pitch: float, shape: tuple[int, int, int], s: CleanSettings
-) -> _Survey:
-    """Ask the field slab by slab (along x), keeping a float32 and three bits a cell."""
-    opaque_pitch = s.field_pitch or pitch
-    faint_rule = dataclasses.replace(s.rule, threshold=s.rule.threshold * s.faint)
-    origin = lattice_origin(aabb, pitch, shape)
-    xs, ys, zs = (origin[axis] + (np.arange(shape[axis]) + 0.5) * pitch for axis in range(3))
-    signed = np.full(shape, EMPTY, dtype=np.float32)
-    occupied, judged, protected = np.zeros(shape, bool), np.zeros(shape, bool), np.zeros(shape, bool)
-    dropped, lowest, highest = 0, math.inf, -math.inf
-    rows = max(1, s.chunk // (shape[1] * shape[2]))
-    for start in range(0, shape[0], rows):
-        part = slice(start, start + rows)
-        positions = np.stack(np.meshgrid(xs[part], ys, zs, indexing="ij"), axis=-1)
-        inside = ((positions >= aabb[0]) & (positions <= aabb[1])).all(axis=-1)
-        values, places = query(positions[inside]), positions[inside]
-        if s.drop_invalid:
-            invalid = ~(np.isfinite(values) & (values >= 0))
-            dropped += int(invalid.sum())
-            values = np.where(invalid, 0.0, values)
-        else:
-            check_density(values, places, caller="clean")
-        lowest, highest = min(lowest, values.min(initial=math.inf)), max(highest, values.max(initial=-math.inf))
-        density = np.zeros(inside.shape)
-        density[inside] = values
-        signed[part] = s.rule.encode(density, opaque_pitch, soft=s.soft)
-        occupied[part] = s.rule.occupied(density, opaque_pitch)
-        judged[part] = faint_rule.occupied(density, opaque_pitch)
-        for box in s.keep_boxes:
-            protected[part] |= ((positions >= box[0]) & (positions <= box[1])).all(axis=-1)
-    warn_if_constant(lowest, highest, math.prod(shape), caller="clean")
-    return _Survey(signed, occupied, judged | occupied, protected, dropped)
-
-
 def _score(
-    survey: _Survey, denoiser: Denoiser, s: CleanSettings, aabb: NDArray[np.float64], pitch: float,
+    survey: Survey, denoiser: Denoiser, s: CleanSettings, aabb: NDArray[np.float64], pitch: float,
     cameras: Cameras | None, maps: TransmittanceMaps | None, progress: Progress | None,
 ) -> tuple[FloatGrid, int]:  # fmt: skip
     """Weighted mean of the levels' votes, and the windows it took."""

@@ -30,22 +30,20 @@ def label_components(occupied: Mask, *, connectivity: int = 26) -> tuple[NDArray
         labels ``(X, Y, Z)``: 0 where empty, else 1 … count, in the order of each component's first voxel
         (C order, as scipy's); and the count.
     """
-    cells = np.flatnonzero(occupied)
-    number = np.full(occupied.size, -1, dtype=np.int64)
+    padded = np.pad(occupied, 1)  # so that a step never leaves the grid
+    cells = np.flatnonzero(padded)
+    number = np.full(padded.size, -1, dtype=np.int64)
     number[cells] = np.arange(cells.size)
-    index = np.stack(np.unravel_index(cells, occupied.shape), axis=-1)
     edges = []
     for step in neighbour_steps(connectivity):
-        there = index + step
-        inside = ((there >= 0) & (there < occupied.shape)).all(axis=1)
-        flat = np.ravel_multi_index(tuple(there[inside].T), occupied.shape)
-        other = number[flat]
-        edges.append(np.stack([np.flatnonzero(inside), other])[:, other >= 0])
+        other = number[cells + int(np.dot(step, [padded.shape[1] * padded.shape[2], padded.shape[2], 1]))]
+        touching = np.flatnonzero(other >= 0)
+        edges.append(np.stack([touching, other[touching]]))
     parent = _join(cells.size, np.concatenate(edges, axis=1))
     roots, compact = np.unique(parent, return_inverse=True)
-    labels = np.zeros(occupied.size, dtype=np.int64)
-    labels[cells] = compact + 1
-    return labels.reshape(occupied.shape), len(roots)
+    labels = np.zeros(occupied.shape, dtype=np.int64)
+    labels[occupied] = compact + 1
+    return labels, len(roots)
 
 
 def _join(count: int, edges: NDArray[np.int64]) -> NDArray[np.int64]:

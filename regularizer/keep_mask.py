@@ -29,8 +29,9 @@ class KeepMask:
         aabb: ``(2, 3)`` scene units; what lies outside is never changed.
         pitch: side of a cell, scene units.
         cells: ``(X, Y, Z)`` bool, True to keep.
-        details: JSON-able: ``occupied``, ``removed``, ``faint_removed`` and ``dropped`` cells, ``windows`` sent,
-            ``regions`` removed (largest first: ``voxels, volume, box, confidence``), ``region_count``, ``settings``.
+        details: JSON-able: ``occupied``, ``removed``, ``faint_removed`` and ``dropped`` cells, positions ``asked``,
+            ``windows`` sent, ``regions`` removed (largest first: ``voxels, volume, box, confidence``),
+            ``region_count``, ``settings``.
     """
 
     aabb: NDArray[np.float64]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from .denoise import BATCH, run_denoiser
 FloatGrid = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 Progress = Callable[[int, int], None]
+Scalar = TypeVar("Scalar", bound=np.generic)
 
 
 def window_weight(resolution: int) -> FloatGrid:
@@ -42,7 +44,7 @@ def shrink(signed: FloatGrid, factor: int) -> FloatGrid:
     return result
 
 
-def grow(values: FloatGrid, factor: int, shape: tuple[int, ...]) -> FloatGrid:
+def grow(values: NDArray[Scalar], factor: int, shape: tuple[int, ...]) -> NDArray[Scalar]:
     """Repeat each cell ``factor`` times along each axis and cut to ``shape``."""
     for axis in range(3):
         values = np.repeat(values, factor, axis=axis)

@@ -69,8 +69,9 @@ def grid_density_fn(density: NDArray[Any], aabb: ArrayLike) -> DensityFn:
         step = np.where(shape > 1, strides, 0)
         base = low @ strides
         total = np.zeros(points.shape[:-1], dtype=np.float32)
+        shares = [(1.0 - share[..., axis], share[..., axis]) for axis in range(3)]
         for corner in np.ndindex(2, 2, 2):
-            weight = np.where(corner, share, 1.0 - share).prod(axis=-1)
+            weight = shares[0][corner[0]] * shares[1][corner[1]] * shares[2][corner[2]]
             total += weight * flat[base + int(np.dot(corner, step))]
         return np.where(inside, total, np.float32(0.0))[..., None]
 

@@ -142,7 +142,7 @@ def test_nothing_at_all_and_everything_full(kit):
 
 
 def test_a_callable_that_does_not_look_at_its_positions_is_pointed_out(kit):
-    with pytest.warns(UserWarning, match="clean: density_fn returned 4 at each of 4000 places"):
+    with pytest.warns(UserWarning, match="clean: density_fn returned 4 at each of 4500 places"):
         clean(lambda p: np.full(len(p), 4.0), BOX, denoiser=kit.numpy_denoiser(kit.identity), resolution=20)
 
 
