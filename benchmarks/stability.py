@@ -27,7 +27,7 @@ from unghost.regularizer.visibility import ViewCounter
 
 BOX = np.array([[-1.0] * 3, [1.0] * 3])
 PITCH = 0.0625
-TARGET = -math.log1p(-0.1)  # by hand: where a cell becomes occupied, up to which is filled by default
+TARGET = -math.log1p(-0.3)  # by hand: up to which is filled by default
 LARGEST = float(np.finfo(np.float32).max)
 
 
@@ -173,9 +173,9 @@ def uniform_cube(value: float, answer: float) -> float:
 
 
 def timestep(step: int) -> float:
-    loss = build(None, timestep=step)(lambda p: torch.full((len(p),), 3.0))["dsds"].item()
+    loss = build(None, timestep=step)(lambda p: torch.full((len(p),), 1.5))["dsds"].item()
     clean(lambda p: np.full(len(p), 3.0), BOX, denoiser=Fixed(None), resolution=16, timestep=step)
-    return relative(loss, 3.0 * PITCH)  # opacity .17: shown as negative, hence pushed out
+    return relative(loss, 1.5 * PITCH)  # opacity .09: shown as -.82, hence pushed out
 
 
 def nothing() -> None:

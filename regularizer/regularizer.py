@@ -21,7 +21,7 @@ from ..core.aabb import as_aabb, scene_extent
 from ..core.arrays import to_numpy
 from ..core.cameras import Cameras, warn_if_turned_away
 from ..core.manifest import Denoiser
-from ..core.occupancy import DECISION, EMPTY, opacity_from_density, warn_if_constant
+from ..core.occupancy import EMPTY, opacity_from_density, warn_if_constant
 from ..core.schedule import check_timestep
 from .context import viewing_cameras
 from .cube_context import FollowedRays, complete_channels, cube_surroundings
@@ -30,7 +30,7 @@ from .denoise import check_denoiser, run_denoiser
 from .losses import cube_parts, cubewise_mean, dsds_loss, stable_mean, upcast, visibility_loss, widest
 from .proposals import ImportanceGrid
 from .queries import field_device
-from .settings import RegularizerSettings
+from .settings import SURE, RegularizerSettings
 from .tensor_queries import DensityFn, query_tensors
 from .visibility import ViewCounter, grow_box, visibility_points
 
@@ -47,7 +47,8 @@ class DensityRegularizer:
 
     Departures from the paper: under the opacity rule (the default) the losses act on the optical depth
     ``density * pitch`` rather than on the density, so the weights do not depend on the scene's unit, and a voxel
-    counts as occupied by its opacity; ``OccupancyRule.paper()`` restores raw densities, bits and tau = w = 0.01.
+    counts as occupied by its opacity; voxels of which the denoiser is not sure are left alone.
+    ``RegularizerSettings.paper()`` restores raw densities, bits, one threshold and tau = w = 0.01.
     A cube without one occupied voxel is not sent to the denoiser: all of it counts as empty (m = 1), so faint
     density there is still pushed out. Voxels outside the box are shown as empty and left out of the loss.
 
@@ -100,7 +101,7 @@ class DensityRegularizer:
         self.field_pitch, self.device, self.cameras = field_pitch, device, cameras
         s = self.settings
         self.threshold = denoiser.manifest.removal_threshold if s.threshold is None else s.threshold
-        self.fill_threshold = max(self.threshold, DECISION) if s.fill_threshold is None else s.fill_threshold
+        self.fill_threshold = max(self.threshold, SURE) if s.fill_threshold is None else s.fill_threshold
         if self.fill_threshold < self.threshold:
             raise ValueError(
                 f"DensityRegularizer: fill_threshold must be >= threshold={self.threshold}, got {self.fill_threshold}"

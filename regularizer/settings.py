@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from ..core.occupancy import OccupancyRule
 from ..core.schedule import check_timestep
@@ -13,6 +14,9 @@ from .proposals import Strategy
 from .visibility import PointKind
 
 Timestep = int | Callable[[int], int] | None
+
+SURE = 0.9  # score from which a voxel is filled
+FILLED = 0.3  # opacity up to which
 
 
 @dataclass(frozen=True)
@@ -29,10 +33,11 @@ class RegularizerSettings:
         uniform_share: of the mixed strategy, in [0, 1].
         timestep: for the denoiser; None for its default, or a function of the step.
         threshold: ``x0_pred`` below it is pushed out (0: the paper); None for what the manifest advises ``clean``.
-        fill_threshold: ``x0_pred`` at or above it is filled; None for 0 (the paper) or ``threshold`` if higher.
+        fill_threshold: ``x0_pred`` at or above it is filled (0: the paper); what lies between the two is left alone.
+            None for .9, or ``threshold`` if higher.
         target: ``w`` of eq. 2, up to which it is filled: an opacity of a field cell in (0, 1), or a density > 0 under
-            the density rule, at or above the rule's threshold. None for that threshold: then hardly anything is filled,
-            as what is filled never counts as occupied. With .9 holes close (and fog may set).
+            the density rule, at or above the rule's threshold. None for .3 under the opacity rule (more closes more
+            holes, and fog may set), and for the threshold itself (the paper) under the density rule.
         dsds_weight, visibility_weight: factors of the losses; 0 switches one off, its queries too. Under the
             opacity rule the losses are optical depths per cell, so the weights do not depend on the scene's unit.
         visibility_samples: points a step for the visibility loss.
@@ -57,7 +62,7 @@ class RegularizerSettings:
     strategy: Strategy = "mixed"
     uniform_share: float = 0.25
     timestep: Timestep = None
-    threshold: float | None = 0.0
+    threshold: float | None = -0.7
     fill_threshold: float | None = None
     target: float | None = None
     dsds_weight: float = 0.1
@@ -112,8 +117,20 @@ class RegularizerSettings:
 
     def target_density(self) -> float:
         """``w`` as the loss takes it: an optical depth of a cell, under the density rule a density."""
-        target = self.rule.threshold if self.target is None else self.target
+        target = self.target
+        if target is None:
+            target = max(FILLED, self.rule.threshold) if self.rule.kind == "opacity" else self.rule.threshold
         return target if self.rule.kind == "density" else -math.log1p(-target)
+
+    @classmethod
+    def paper(cls, **overrides: Any) -> RegularizerSettings:
+        """What the paper has: raw densities and bits, one threshold, cubes of 1 to 10 % by importance, rays' samples.
+
+        The weights stay ours, as it gives none.
+        """
+        known = {"threshold": 0.0, "fill_threshold": 0.0, "rule": OccupancyRule.paper(), "soft": False,
+                 "edge_range": (0.01, 0.1), "strategy": "importance", "visibility_kind": "rays"}  # fmt: skip
+        return cls(**{**known, **overrides})
 
 
 def _is_range(edge_range: tuple[float, float]) -> bool:

@@ -66,7 +66,7 @@ def test_filling_by_hand(kit, aabb):
 @pytest.mark.parametrize(
     ("settings", "expected"),
     [
-        ({}, -math.log(0.9)),
+        ({}, -math.log(0.7)),
         ({"rule": OccupancyRule("opacity", 0.95)}, -math.log(0.05)),
         ({"target": 0.5}, math.log(2)),
         ({"rule": OccupancyRule.paper()}, 0.01),
@@ -293,10 +293,28 @@ def test_thresholds_come_from_the_manifest_and_can_be_set(kit, aabb):
         regularizer, _ = build(kit, aabb, lambda c: np.full_like(c, -0.2), **settings)
         return regularizer(lambda p: level.expand(len(p)))["dsds"].item()
 
-    assert run() == pytest.approx(0.25)  # -0.2 < 0: empty
-    assert run(removal_threshold=-0.5) == pytest.approx(0.25)  # the paper's rule, whatever clean() is advised
-    assert run(removal_threshold=-0.5, threshold=None) == 0.0  # between removal and filling
-    assert run(threshold=-0.5) == 0.0
+    assert run() == 0.0  # between removal and filling
+    assert run(threshold=0.0) == pytest.approx(0.25)  # -0.2 < 0: empty
+    assert run(removal_threshold=0.0) == 0.0  # whatever clean() is advised
+    assert run(removal_threshold=0.0, threshold=None) == pytest.approx(0.25)
+    assert run(removal_threshold=-0.5, threshold=None) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("score", "expected"),
+    [(-0.71, 0.1), (-0.69, 0.0), (0.89, 0.0), (0.91, -math.log(0.7) - 0.1)],
+)
+def test_only_what_is_sure_moves(kit, aabb, score, expected):
+    regularizer, _ = build(kit, aabb, lambda c: np.full_like(c, score), skip_empty=False)
+    assert regularizer(lambda p: torch.full((len(p),), 0.8))["dsds"].item() == pytest.approx(expected, rel=1e-6)
+
+
+def test_the_papers_settings(kit, aabb):
+    settings = RegularizerSettings.paper(cubes=3)
+    assert (settings.threshold, settings.fill_threshold, settings.cubes, settings.soft) == (0.0, 0.0, 3, False)
+    for score, expected in ((-0.01, 0.004), (0.01, 0.006)):  # eq. 2 of raw densities, w = tau = .01
+        regularizer, _ = build(kit, aabb, lambda c, s=score: np.full_like(c, s), settings=settings, skip_empty=False)
+        assert regularizer(lambda p: torch.full((len(p),), 0.004))["dsds"].item() == pytest.approx(expected, rel=1e-5)
 
 
 def test_timestep_schedule(kit, aabb):
