@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -50,7 +51,7 @@ def fill_row(name: str, *, steps: int, target: float | None = None, seed: int = 
         optimizer.step()
     found = np.asarray(RULE.occupied(field.cells().detach().numpy(), room.pitch))
     row = {
-        "method": f"filling, {name}", "target": target or RULE.threshold, "steps": steps,
+        "method": f"filling, {name}", "target": -math.expm1(-regularizer.settings.target_density()), "steps": steps,
         "holes": HOLES, "cells_missing": int((solid & missing).sum()),
         "holes_filled": float(found[solid & missing].mean()), "surface_kept": float(found[solid & ~missing].mean()),
         "cells_added": float((found & ~room.surface(RULE)).sum() / solid.sum()),

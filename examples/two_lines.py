@@ -52,12 +52,12 @@ def main() -> None:
     optimizer = torch.optim.Adam(field.parameters(), lr=0.4)  # raw values reach 60: they have far to go
 
     regularizer = DensityRegularizer(load_denoiser(), aabb=AABB, field_pitch=PITCH, cubes=8)
-    for step in range(120):
+    for step in range(180):
         loss = sum(regularizer(field.density_fn).values())  # add it to your photometric loss
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-        if step % 30 == 0 or step == 119:
+        if step % 30 == 0 or step == 179:
             now = torch.nn.functional.softplus(field.raw.detach())[0, 0].numpy()
             opaque = 1 - np.exp(-now * PITCH) > 0.1
             left, kept = opaque[floaters].mean(), opaque[table].mean()

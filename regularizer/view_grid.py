@@ -8,6 +8,8 @@ sides themselves, and the few that lie between the inner and the outer one are l
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,6 +19,7 @@ from ..core.cube_views import BORDER_POINTS
 MOST_TANGENTIAL = 0.05  # of p1, p2: beyond, a lens may fold where its radial terms do not tell
 COARSEST, LEVELS = 8, 3  # cells along an axis at first, and how often: up to 32
 CHUNK = 4096  # cells looked at together
+GROUP = 16  # cameras asked together: what enough of them see is not held against the others
 SLACK = 1e-5  # of the distances involved: float32 rounds
 OPEN = -1
 FloatArray = NDArray[np.float64]
@@ -74,6 +77,18 @@ def _planes(cameras: Cameras, rectangles: FloatArray) -> NDArray[np.float32]:
     return np.concatenate([normals, offsets[..., None]], axis=-1).astype(np.float32)
 
 
+def _within(
+    planes: NDArray[np.float32], centers: FloatArray, half: FloatArray | float, slack: np.float32
+) -> NDArray[np.bool_]:
+    """On the inner side of all four planes ``(4, N, 4)`` by ``slack`` and the extent of a box; ``(N, M)``."""
+    places = np.concatenate([centers.T, np.ones((1, len(centers)))]).astype(np.float32)
+    extent, sign = np.broadcast_to(half, 3).astype(np.float32), np.sign(slack)
+    within = np.ones((planes.shape[1], len(centers)), dtype=bool)
+    for side in planes:
+        within &= side @ places >= (sign * (np.abs(side[:, :3]) @ extent) + slack)[:, None]
+    return within
+
+
 class ViewGrid:
     """A box cut into 32^3 cells; each holds the views of all its points, up to ``min_views``, or ``OPEN``.
 
@@ -87,8 +102,13 @@ class ViewGrid:
         self._cameras = cameras
         self.aabb, self.min_views = np.asarray(aabb, dtype=np.float64), min_views
         sure, possible = image_rectangles(cameras)
-        self._reliable = np.isfinite(sure).all(axis=1)
-        self._inner, self._outer = _planes(cameras, sure), _planes(cameras, possible)
+        reliable = np.asarray(np.isfinite(sure).all(axis=1))
+        inner, outer = _planes(cameras, sure), _planes(cameras, possible)
+        count = -(-len(cameras) // GROUP)  # every so-many-th camera: neighbours see alike
+        self._groups = [
+            (g, reliable[g, None], inner[:, g], outer[:, g])
+            for g in (np.arange(first, len(cameras), count) for first in range(count))
+        ]
         reach = np.abs(self.aabb).max() + np.abs(cameras.origins).max(initial=0.0)
         self._slack = np.float32(SLACK * reach)
         self.cells = np.full((COARSEST << (LEVELS - 1),) * 3, OPEN, dtype=np.int16)
@@ -104,9 +124,13 @@ class ViewGrid:
         left = []
         for start in range(0, len(cells), CHUNK):
             part = cells[start : start + CHUNK]
-            every, any_ = self._bounds(self.aabb[0] + (part + 0.5) * side, side / 2)
-            least, most = every.sum(axis=0), any_.sum(axis=0)
-            settled = (least >= self.min_views) | (least == most)
+            centers = self.aabb[0] + (part + 0.5) * side
+            least = self._surely(centers, side / 2)
+            settled = least >= self.min_views
+            few = np.flatnonzero(~settled)
+            for _, point in self._disputed(centers[few], side / 2):
+                few[point] = -1
+            settled[few[few >= 0]] = True
             size = 1 << (LEVELS - 1 - level)
             blocks = self.cells.reshape(*(n for _ in range(3) for n in (COARSEST << level, size)))
             x, y, z = part[settled].T
@@ -114,17 +138,24 @@ class ViewGrid:
             left.append(part[~settled])
         return np.concatenate(left) if left else cells[:0]
 
-    def _bounds(self, centers: FloatArray, half: FloatArray) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Which cameras see every point of each box about ``centers (M, 3)``, and which may see any; ``(N, M)``."""
-        places = np.concatenate([centers.T, np.ones((1, len(centers)))]).astype(np.float32)
-        extent = half.astype(np.float32)
-        every = np.ones((len(self._cameras), len(centers)), dtype=bool)
-        every[~self._reliable] = False
-        any_ = np.ones_like(every)
-        for inner, outer in zip(self._inner, self._outer):
-            every &= inner @ places >= (np.abs(inner[:, :3]) @ extent + self._slack)[:, None]
-            any_ &= outer @ places >= -(np.abs(outer[:, :3]) @ extent + self._slack)[:, None]
-        return every, any_
+    def _surely(self, centers: FloatArray, half: FloatArray | float) -> NDArray[np.int64]:
+        """How many cameras see every point of each box about ``centers (M, 3)``, up to ``min_views`` at least."""
+        total, open_ = np.zeros(len(centers), dtype=np.int64), np.arange(len(centers))
+        for _, reliable, inner, _ in self._groups:
+            if open_.size == 0:
+                break
+            total[open_] += (_within(inner, centers[open_], half, self._slack) & reliable).sum(axis=0)
+            open_ = open_[total[open_] < self.min_views]
+        return total
+
+    def _disputed(
+        self, centers: FloatArray, half: FloatArray | float
+    ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+        """Cameras and boxes of which a camera may see some point but does not surely see all, group by group."""
+        for group, reliable, inner, outer in self._groups:
+            perhaps = _within(outer, centers, half, -self._slack)
+            camera, box = np.nonzero(perhaps & ~(_within(inner, centers, half, self._slack) & reliable))
+            yield group[camera], box
 
     def count(self, positions: FloatArray) -> NDArray[np.int64]:
         """``min(view count, min_views)`` of points ``(N, 3)``, ``OPEN`` outside the box; ``(N,)``."""
@@ -142,11 +173,10 @@ class ViewGrid:
         left = np.flatnonzero((found == OPEN) & inside)
         for start in range(0, len(left), CHUNK):
             part = left[start : start + CHUNK]
-            every, any_ = self._bounds(positions[part], np.zeros(3))
-            total = every.sum(axis=0)
-            camera, point = np.nonzero((any_ & ~every)[:, unsure := total < self.min_views])
-            points = np.flatnonzero(unsure)[point]
-            seen = self._cameras.sees(camera, positions[part][points])
-            total += np.bincount(points[seen], minlength=len(part))
+            total = self._surely(positions[part], 0.0)
+            unsure = np.flatnonzero(total < self.min_views)
+            for camera, point in self._disputed(positions[part[unsure]], 0.0):
+                seen = self._cameras.sees(camera, positions[part[unsure[point]]])
+                total += np.bincount(unsure[point[seen]], minlength=len(part))
             found[part] = np.minimum(total, self.min_views)
         return found

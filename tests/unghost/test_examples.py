@@ -32,8 +32,8 @@ def test_runs(path, tmp_path):
     printed = run(path.stem, folder=tmp_path)
     if path.stem == "two_lines":
         left, kept = (float(share) for share in re.findall(r"([\d.]+)%", printed.splitlines()[-1]))
-        assert left < 20
-        assert kept > 90
+        assert left < 5
+        assert kept > 98
     else:
         gone, kept = (float(share) for share in re.search(r"([\d.]+)% of .* ([\d.]+)% of", printed).groups())
         assert gone >= AT_LEAST[path.stem][0]
