@@ -174,9 +174,7 @@ def main() -> None:
         found["the field"].append({"room": index, **room.scores(room.field)})
         for way, settings in WAYS.items():
             field, record = room.tuned(settings, options.steps)
-            found[way].append(
-                {"room": index, **room.scores(field), "seconds": record["seconds"], "psnr": record["psnr"]}
-            )
+            found[way].append({"room": index, **room.scores(field), "psnr": record["psnr"]})
             say(f"room {index}, {way}: " + " ".join(f"{k} {v:.3f}" for k, v in found[way][-1].items() if k != "room"))
     if not found["the field"]:
         raise SystemExit("dsds_rooms: no room is left; give more --fit-steps, or other --rooms")

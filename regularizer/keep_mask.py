@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ..core.aabb import as_aabb
 from ..core.arrays import is_tensor, to_numpy
@@ -114,6 +115,27 @@ class KeepMask:
             kept[row] = self._keep(np.stack(np.meshgrid([x], axes[1], axes[2], indexing="ij"), axis=-1)[0])
         result: NDArray[Any] = np.where(kept.reshape(kept.shape + (1,) * (values.ndim - 3)), values, 0)
         return result.astype(values.dtype, copy=False)
+
+    def restored(self, boxes: Sequence[ArrayLike]) -> KeepMask:
+        """The same mask with all that was removed in some boxes kept again (undo, piece by piece).
+
+        Args:
+            boxes: ``(2, 3)`` each, scene units: those of ``summary()["regions"]``, say. A cell belongs to a box that
+                holds its centre. They are added to ``details["restored"]``; the other details stay as they were.
+        """
+        if not len(boxes):
+            return self
+        chosen = [as_aabb(box, caller="KeepMask.restored: boxes") for box in boxes]
+        axes = [self.origin[axis] + (np.arange(length) + 0.5) * self.pitch for axis, length in
+                enumerate(self.cells.shape)]  # fmt: skip
+        cells = self.cells.copy()
+        for box in chosen:
+            x, y, z = ((axis >= low) & (axis <= high) for axis, low, high in zip(axes, box[0], box[1]))
+            cells |= x[:, None, None] & y[:, None] & z
+        before = self.details.get("restored", [])
+        return dataclasses.replace(
+            self, cells=cells, details={**self.details, "restored": [*before, *(box.tolist() for box in chosen)]}
+        )
 
     def summary(self) -> dict[str, Any]:
         """Counts, ``removed_share`` of the occupied cells (0 if there are none), and the removed regions."""

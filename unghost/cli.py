@@ -22,11 +22,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     import tyro
 
-    from . import commands, commands_masks, commands_prior, commands_recipes, commands_sample
+    from . import commands, commands_clean, commands_masks, commands_prior, commands_recipes, commands_sample
 
     verbs: dict[str, Callable[..., Any]] = {
         "demo": commands.demo,
-        "clean": commands.clean,
+        "clean": commands_clean.clean,
         "masks": commands_masks.masks,
         "bench": commands.bench,
         "curate": commands_recipes.curate,

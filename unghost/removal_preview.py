@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from .core.occupancy import OccupancyRule
 from .data_recipes.render import GHOST, png_bytes
 from .regularizer.keep_mask import KeepMask
+from .regularizer.queries import make_query
 
 SIDE = 420  # pixels that the longest side of the box takes at least
 GAP = 12
@@ -21,16 +22,16 @@ FAR, NEAR = 0.45, 0.92  # grey of kept cells at the far side of the box and at t
 
 
 def occupied_cells(mask: KeepMask, density_fn: Callable[[Any], Any], rule: OccupancyRule | None = None) -> Any:
-    """Which of the mask's cells the field occupies ``(X, Y, Z)`` bool; asked at their centres, slab by slab."""
+    """Which of the mask's cells the field (numpy or torch) occupies ``(X, Y, Z)`` bool; asked at their centres."""
     chosen, shape = rule or OccupancyRule(), mask.cells.shape
     axes = [mask.origin[axis] + (np.arange(shape[axis]) + 0.5) * mask.pitch for axis in range(3)]
+    query = make_query(density_fn, place=mask.aabb.mean(axis=0), caller="occupied_cells")
     occupied = np.zeros(shape, dtype=bool)
     rows = max(1, SLAB // (shape[1] * shape[2]))
     for start in range(0, shape[0], rows):
         part = slice(start, start + rows)
         places = np.stack(np.meshgrid(axes[0][part], axes[1], axes[2], indexing="ij"), axis=-1)
-        density = np.asarray(density_fn(places.reshape(-1, 3).astype(np.float32)), dtype=np.float64)
-        occupied[part] = chosen.occupied(density.reshape(places.shape[:-1]), mask.pitch)
+        occupied[part] = chosen.occupied(query(places.reshape(-1, 3)).reshape(places.shape[:-1]), mask.pitch)
     return occupied
 
 

@@ -70,7 +70,13 @@ def pitch_of(gaussians: Gaussians, aabb: NDArray[np.float64], resolution: int | 
 
 
 def clean_splats(
-    gaussians: Gaussians, *, denoiser: Any = None, resolution: int | None = None, reach: float = REACH, **options: Any
+    gaussians: Gaussians,
+    *,
+    denoiser: Any = None,
+    resolution: int | None = None,
+    reach: float = REACH,
+    mask: KeepMask | None = None,
+    **options: Any,
 ) -> CleanedSplats:
     """Decide which Gaussians to keep.
 
@@ -79,6 +85,7 @@ def clean_splats(
         denoiser: from :func:`unghost.load_denoiser`; None for the shipped one.
         resolution: cells along the box's longest side, >= 8: how fine the judgement is. None: by the splats' sizes.
         reach: of :func:`box_of`, >= 1; what is beyond stays.
+        mask: of an earlier cleaning, to repeat it; None to judge.
         **options: of :func:`unghost.clean`: ``strength``, ``keep_boxes``, ``cameras``, ``progress``, …
     """
     if resolution is not None and resolution < 8:
@@ -86,9 +93,9 @@ def clean_splats(
     if not 1.0 <= reach < np.inf:
         raise ValueError(f"clean_splats: reach must be finite and >= 1, got {reach}")
     aabb = box_of(gaussians, reach=reach)
-    pitch = pitch_of(gaussians, aabb, resolution)
+    pitch = pitch_of(gaussians, aabb, resolution) if mask is None else mask.pitch
     field = SplatField(gaussians, pitch=pitch)
-    mask = clean(field.density_fn, aabb, denoiser=denoiser, field_pitch=pitch, **options)
+    mask = mask or clean(field.density_fn, aabb, denoiser=denoiser, field_pitch=pitch, **options)
     scores = keep_scores(gaussians, mask)
     return CleanedSplats(scores, scores >= KEPT_FROM, mask, field)
 

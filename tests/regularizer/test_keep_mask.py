@@ -142,3 +142,20 @@ def test_construction_errors():
         KeepMask(BOX, 0.5, np.ones((4, 2, 2)))
     with pytest.raises(ValueError, match="pitch must be finite"):
         KeepMask(BOX, 0.0, np.ones((4, 2, 2), bool))
+
+
+def test_what_was_removed_in_a_box_can_be_taken_back():
+    rng = np.random.default_rng(2)
+    box = np.array([[0.0, 0, 0], [4, 3, 2]])
+    mask = KeepMask(box, 0.5, rng.random((8, 6, 4)) < 0.5, {"removed": 9})
+    first, second = [[0.0, 0, 0], [1.0, 3, 2]], [[3.9, 0, 0], [9.0, 1.3, 2]]  # the latter's last layer has no centre
+    restored = mask.restored([first])
+    assert restored.cells[:2].all()
+    assert (restored.cells[2:] == mask.cells[2:]).all()
+    twice = restored.restored([second])
+    assert twice.cells.sum() == restored.cells.sum()
+    assert twice.details == {"removed": 9, "restored": [first, second]}
+    assert mask.details == {"removed": 9}
+    assert mask.restored([]) is mask
+    with pytest.raises(ValueError, match=r"KeepMask\.restored: boxes"):
+        mask.restored([[[1, 0, 0], [0, 1, 1]]])

@@ -4,10 +4,11 @@ import io
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from unghost.regularizer.keep_mask import KeepMask
-from unghost.removal_preview import GAP, SIDE, preview_png
+from unghost.removal_preview import GAP, SIDE, occupied_cells, preview_png
 
 SHAPE = (6, 8, 10)  # x, y, z
 
@@ -45,3 +46,18 @@ def test_what_is_nearer_is_lighter(view, near, far):
         return views(np.ones(SHAPE, dtype=bool), lone)[view].min()
 
     assert darkest(far) < darkest(near) < 1.0
+
+
+def test_a_torch_field_is_shown_as_a_numpy_one_is():
+    mask = KeepMask(np.array([[0.0, 0, 0], [1, 1, 1]]), 0.25, np.ones((4, 4, 4), bool))
+    net = torch.nn.Linear(3, 1)
+    with torch.no_grad():
+        net.weight.copy_(torch.tensor([[40.0, 0.0, 0.0]]))
+        net.bias.fill_(-20.0)
+
+    def density_fn(p):
+        return torch.relu(net(p))
+
+    found = occupied_cells(mask, density_fn)
+    assert (found == occupied_cells(mask, lambda p: np.maximum(40 * p[:, 0] - 20, 0))).all()
+    assert found.sum() == 32

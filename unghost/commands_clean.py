@@ -1,0 +1,148 @@
+"""The verb that cleans files. Its signature is the command line; heavy imports wait for it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from tyro.conf import Positional, UseAppendAction, arg
+
+from .commands import Threads
+
+if TYPE_CHECKING:
+    from .regularizer.keep_mask import KeepMask
+
+Box = tuple[float, float, float, float, float, float]
+
+
+def clean(
+    source: Positional[Path],
+    out: Annotated[Path | None, arg(aliases=["-o"])] = None,
+    keep: Path | None = None,
+    preview: Path | None = None,
+    mask: Path | None = None,
+    keep_box: UseAppendAction[tuple[Box, ...]] = (),
+    cameras: Path | None = None,
+    denoiser: str = "default",
+    strength: float = 0.5,
+    resolution: int | None = None,
+    reach: float | None = None,
+    threads: Threads = 0,
+) -> None:
+    """Clean a density grid (.npz: density (X, Y, Z) per scene unit, aabb (2, 3), cubic cells) or 3D Gaussians (.ply).
+
+    Args:
+        source: the file to clean; it is not changed.
+        out: the cleaned grid or splats; NAME-clean beside it if not given. Every property of a splat that stays is kept
+            byte for byte, and keep_score is added.
+        keep: the mask of what was kept, with which --mask repeats the cleaning; NAME-keep.npz if not given
+            (with --mask: none).
+        preview: a PNG to write instead of all that: what would stay and what would go, from three sides; the regions
+            that would go are listed.
+        mask: a keep mask of an earlier cleaning, applied as it is instead of judging anew.
+        keep_box: x0 y0 z0 x1 y1 z1, scene units: nothing in this box is removed; may be given several times. With
+            --mask, takes back what that removed there (the boxes of the preview's table, say).
+        cameras: a transforms.json (nerfstudio's format) of the training photos, in the file's own world; where few
+            or none of them look, ghosts are likelier. The photos themselves are not needed.
+        denoiser: a shipped name or an .onnx file.
+        strength: 0 removes nothing, 0.5 what the denoiser advises, 1 everything.
+        resolution: of splats, cells along the longest side of the box; by the splats' sizes if not given.
+        reach: of splats, how many times the scene's core (98 % of the opacity) is cleaned (twice if not given); what
+            is beyond stays.
+        threads: of onnxruntime; 0 leaves the choice to it.
+    """
+    from .regularizer.keep_mask import KeepMask
+
+    splats = source.suffix == ".ply"
+    target = None if preview else out or source.with_name(f"{source.stem}-clean{source.suffix}")
+    if preview or (mask and keep is None):
+        keep = None
+    else:
+        keep = keep or source.with_name(f"{source.stem}-keep.npz")
+    _check_distinct(source=source, out=target, keep=keep, preview=preview, mask=mask)
+    if not splats and (resolution is not None or reach is not None):
+        raise ValueError(f"clean: --resolution and --reach are for splats (.ply); {source.name} has its own cells")
+    boxes = [[box[:3], box[3:]] for box in keep_box]
+    options: dict[str, Any]
+    if mask is not None:
+        options = {"mask": KeepMask.load(mask).restored(boxes)}
+    else:
+        options = {"keep_boxes": tuple(boxes), **_judging(denoiser, threads, strength, cameras)}
+        options |= {"resolution": resolution} if splats else {}
+        options |= {} if reach is None else {"reach": reach}
+    found, density_fn = (_clean_splats if splats else _clean_grid)(source, target, **options)
+    if preview:
+        from .removal_preview import region_table, write_preview
+
+        write_preview(preview, found, density_fn)
+        print(f"{region_table(found)}\nlook at {preview}; nothing was changed")
+        return
+    if keep is not None:
+        keep.parent.mkdir(parents=True, exist_ok=True)
+        found.save(keep)
+    summary = found.summary()
+    print(f"removed {summary['removed']} of {summary['occupied']} occupied cells ({summary['removed_share']:.1%})"
+          + (f", what lay in {len(summary['restored'])} boxes taken back" if "restored" in summary else ""))  # fmt: skip
+    print(f"cleaned: {target}" + (f"\nkeep mask: {keep}" if keep else ""))
+
+
+def _judging(denoiser: str, threads: int, strength: float, cameras: Path | None) -> dict[str, Any]:
+    """What ``clean`` is given to judge with."""
+    from .denoisers import load_denoiser
+    from .evaluation.captures import load_cameras
+
+    return {
+        "denoiser": load_denoiser(denoiser, backend="onnx", threads=threads or None), "strength": strength,
+        "cameras": None if cameras is None else load_cameras(cameras), "progress": _windows(),
+    }  # fmt: skip
+
+
+def _check_distinct(**files: Path | None) -> None:
+    """No file is written over another: neither over the one to clean nor over what is written beside it."""
+    named = [(name, path.resolve()) for name, path in files.items() if path is not None]
+    for index, (name, path) in enumerate(named):
+        for other, same in named[:index]:
+            if path == same or (path.exists() and same.exists() and path.samefile(same)):
+                raise ValueError(f"clean: {name} and {other} are the same file, {path.name}; write to another")
+
+
+def _clean_grid(
+    source: Path, target: Path | None, mask: KeepMask | None = None, **options: Any
+) -> tuple[KeepMask, Callable[[Any], Any]]:
+    from .cleaning import clean
+    from .grids import cell_pitch, grid_density_fn, load_grid, save_grid
+
+    density, aabb = load_grid(source)
+    density_fn = grid_density_fn(density, aabb)
+    if mask is None:
+        mask = clean(density_fn, aabb, field_pitch=cell_pitch(aabb, density.shape, caller="clean"), **options)
+    elif abs(mask.aabb - aabb).max() > 1e-4 * float((aabb[1] - aabb[0]).max()):
+        raise ValueError(f"clean: the mask's box must be {source.name}'s {aabb.tolist()}, got {mask.aabb.tolist()}")
+    if target is not None:
+        save_grid(target, mask.apply_grid(density), aabb)
+    return mask, density_fn
+
+
+def _clean_splats(source: Path, target: Path | None, **options: Any) -> tuple[KeepMask, Callable[[Any], Any]]:
+    from .splat_cleaning import clean_ply
+
+    found = clean_ply(source, target, **options)
+    gone = int((~found.keep).sum())
+    print(f"{gone} of {len(found.keep)} Gaussians ({gone / max(len(found.keep), 1):.1%}) are ghosts")
+    return found.mask, found.field.density_fn
+
+
+def _windows() -> Callable[[int, int], None]:
+    """A progress bar of the windows that went through the denoiser, on stderr, gone when it is full."""
+    from tqdm import tqdm
+
+    bar = tqdm(unit="cube", dynamic_ncols=True, leave=False, disable=None)
+
+    def progress(done: int, total: int) -> None:
+        if done < bar.n:  # the next level begins
+            bar.reset()
+        bar.total = total
+        bar.update(done - bar.n)
+
+    return progress
