@@ -56,10 +56,7 @@ def clean(
 
     splats = source.suffix == ".ply"
     target = None if preview else out or source.with_name(f"{source.stem}-clean{source.suffix}")
-    if preview or (mask and keep is None):
-        keep = None
-    else:
-        keep = keep or source.with_name(f"{source.stem}-keep.npz")
+    keep = None if preview or (mask and keep is None) else keep or source.with_name(f"{source.stem}-keep.npz")
     _check_distinct(source=source, out=target, keep=keep, preview=preview, mask=mask)
     if not splats and (resolution is not None or reach is not None):
         raise ValueError(f"clean: --resolution and --reach are for splats (.ply); {source.name} has its own cells")
@@ -82,8 +79,10 @@ def clean(
         keep.parent.mkdir(parents=True, exist_ok=True)
         found.save(keep)
     summary = found.summary()
-    print(f"removed {summary['removed']} of {summary['occupied']} occupied cells ({summary['removed_share']:.1%})"
-          + (f", what lay in {len(summary['restored'])} boxes taken back" if "restored" in summary else ""))  # fmt: skip
+    back = f", what lay in {len(summary['restored'])} boxes taken back" if "restored" in summary else ""
+    print(
+        f"removed {summary['removed']} of {summary['occupied']} occupied cells ({summary['removed_share']:.1%}){back}"
+    )
     print(f"cleaned: {target}" + (f"\nkeep mask: {keep}" if keep else ""))
 
 

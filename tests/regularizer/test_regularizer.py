@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 import torch
 
+from unghost.core.cameras import Cameras
 from unghost.core.occupancy import OccupancyRule
+from unghost.regularizer.clean import clean
 from unghost.regularizer.regularizer import DensityRegularizer
 from unghost.regularizer.settings import RegularizerSettings
 
@@ -462,3 +464,47 @@ def test_a_callable_that_does_not_look_at_its_positions_is_pointed_out(kit, aabb
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         regularizer(lambda positions: nothing.expand(len(positions)))
+
+
+def inside_out():
+    """Cameras about the box that look away from it: OpenCV's poses taken for OpenGL's."""
+    angle = np.linspace(0, 2 * np.pi, 6, endpoint=False)
+    back = -np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)  # the camera's z, towards the middle
+    up = np.tile([0.0, 0.0, 1.0], (6, 1))
+    poses = np.stack([np.cross(up, back), up, back, -4.0 * back], axis=-1)
+    return Cameras.create(poses, np.array([50.0, 50.0, 32.0, 32.0]), 64, 64)
+
+
+def test_cameras_inside_out_are_pointed_out_by_both(kit, aabb):
+    with pytest.warns(UserWarning, match=r"DensityRegularizer: .*OpenCV"):
+        build(kit, aabb, kit.identity, cameras=inside_out())
+    with pytest.warns(UserWarning, match=r"clean: .*OpenCV"):
+        clean(lambda p: p[:, 0] ** 2, aabb, denoiser=kit.numpy_denoiser(kit.identity), resolution=8,
+              cameras=inside_out())  # fmt: skip
+
+
+def test_what_something_hides_counts_as_unseen(kit, aabb):
+    pose = np.eye(4)[None, :3].copy()
+    pose[0, 2, 3] = 3.0  # looks down -z onto the box
+    camera = Cameras.create(pose, np.array([20.0, 20.0, 32.0, 32.0]), 64, 64)
+    wall = np.full((1, 64, 64), 3.0, np.float32)  # the plane z = 0
+    shares = []
+    for depth_maps in (None, wall):
+        regularizer, _ = build(
+            kit, aabb, kit.identity, cameras=camera, depth_maps=depth_maps, dsds_weight=0.0, visibility_kind="uniform"
+        )
+        level = regularizer(lambda p: torch.ones(len(p)))["visibility"].item()
+        share = regularizer.report["unseen"] / regularizer.report["points"]
+        assert level == pytest.approx(0.125 * share)
+        shares.append(share)
+    assert shares[0] < 0.01
+    assert shares[1] == pytest.approx(0.5 - 0.05 * 3 / 2 / (aabb[1][2] - aabb[0][2]) * 2, abs=0.06)
+
+
+def test_weights_feed_the_grid(kit, aabb):
+    regularizer, _ = build(kit, aabb, kit.identity)
+    place = np.array([[0.31, -0.2, 0.4]])
+    regularizer.observe(place, [[0.75]], kind="weight")
+    cell = tuple(np.unravel_index(regularizer.grid.observed.argmax(), regularizer.grid.values.shape))
+    assert regularizer.grid.observed.sum() == 1
+    assert regularizer.grid.values[cell] == 0.75

@@ -1,4 +1,5 @@
 import time
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -166,3 +167,15 @@ def test_errors():
         ViewCounter(rig, min_views=0)
     with pytest.raises(ValueError, match=r"shape \(N, 3\)"):
         ViewCounter(rig)(np.zeros(3))
+
+
+def test_memory_does_not_grow_with_the_cameras():
+    points = np.random.default_rng(5).uniform(BOX[0], BOX[1], (20_000, 3))
+    most = []
+    for count in (50, 2000):
+        rig = cameras(count)
+        tracemalloc.start()
+        ViewCounter(rig, min_views=count, aabb=BOX)(points)  # nobody drops out
+        most.append(tracemalloc.get_traced_memory()[1] / 1e6)
+        tracemalloc.stop()
+    assert most[1] < most[0] + 25  # megabytes; all the cameras' answers at once would take 40 more
