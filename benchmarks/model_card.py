@@ -132,7 +132,8 @@ def section(name: str, path: Path, manifest: Manifest) -> list[str]:
         f"{training['gflop']:.2f} GFLOP a cube. It sees {', '.join(manifest.channels)}.{half} Default timestep "
         f"{manifest.default_timestep}; removal threshold {manifest.removal_threshold:.2f}, for `clean`: the largest of "
         f"those tried at which it keeps {chosen['kept']:g} of the surface of rooms made for that "
-        f"(docs/results/threshold_{name}.json). DSDS decides at 0 unless told otherwise.", "",
+        f"(docs/results/threshold_{name}.json). Score distillation has thresholds of its own "
+        "(docs/regularizer.md).", "",
         *table(("file", "size", "sha256"), files), "",
         f"From random weights: {' and then '.join(map(told, stages(training)))}, on two CPU cores "
         f"({training['precision']}), torch {training['torch']}. In harvested cubes, voxels that are opaque and true "

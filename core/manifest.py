@@ -28,8 +28,8 @@ class Manifest:
             ``signed_opacity`` (a bit is a special case of it).
         resolution: voxels along an edge.
         default_timestep: what the regularizer and ``clean`` use unless told.
-        removal_threshold: ``x0_pred`` below which ``clean`` is advised to remove; 0 is the paper's rule, by which
-            DSDS decides unless told otherwise.
+        removal_threshold: ``x0_pred`` below which ``clean`` is advised to remove (0: the paper's rule). Score
+            distillation has thresholds of its own.
         parameters: number of weights.
         body_bytes, body_sha256: length and hash of the ONNX file before its metadata; 0 and "" in checkpoints.
         training: free-form provenance (recipe, seed, steps, command).

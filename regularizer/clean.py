@@ -1,4 +1,4 @@
-"""Clean a trained field: ask it once on a grid, let the denoiser vote, say what to keep. numpy only, no gradient."""
+"""Clean a trained field: ask it on a grid, let the denoiser vote, say what to keep. numpy only, no gradient."""
 
 from __future__ import annotations
 
@@ -119,9 +119,10 @@ def clean(
 ) -> KeepMask:
     """Find out which density of a field is a ghost.
 
-    The field is asked once, on a grid of cubic cells at its own pitch. Overlapping windows of that grid, and of
-    ones shrunk two times (the largest opacity of each block), go through the denoiser; a cell's score is the
-    weighted mean of all that was predicted for it, and ``strength`` says below which score it is voted empty.
+    The field is asked on a grid of cubic cells at its own pitch, most of empty space left out (``probe``).
+    Overlapping windows of that grid, and of ones shrunk two times (the largest opacity of each block), go through
+    the denoiser; a cell's score is the weighted mean of all that was predicted for it, and ``strength`` says below
+    which score it is voted empty.
     Connected pieces then have the last word: see :func:`unghost.regularizer.decide.decide`.
 
     Args:

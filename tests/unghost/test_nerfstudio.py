@@ -31,6 +31,10 @@ def check(found):
     assert found["installed"]["nerfstudio"] == "1.1.5"
     assert max(found["pixel_error"], found["pixel_error_bent"]) < 1e-2
     assert ours["fields"] == 3  # the field and two proposal networks
+    assert ours["contraction_error"] < 1e-3  # asked at places, or rendered along rays, also beyond the box
+    assert ours["cubes"] == 40
+    assert ours["milliseconds_of_them"] > 0
+    assert found["loaded_by_import"] == []  # the plug-in waits for the first step
     assert ours["regularized_steps"] == -(-ours["steps"] // 5)
     assert ours["last"]["unghost_visibility"] < ours["first"]["unghost_visibility"]
     assert ours["opacity_unseen"] < plain["opacity_unseen"]
