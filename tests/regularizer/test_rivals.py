@@ -49,6 +49,26 @@ def test_total_variation_has_a_gradient_where_nothing_changes():
     assert grid.grad.abs().max() == 0.0
 
 
+@pytest.mark.parametrize("step", [1e-310, 1e-200, 1e160, 1e307])
+def test_total_variation_takes_no_square_of_what_has_none(step):
+    grid = torch.zeros(2, 2, 2, dtype=torch.float64)
+    grid[1, 0, 0], grid[0, 1, 0] = 3 * step, 4 * step
+    grid.requires_grad_()
+    loss = total_variation_loss(grid)
+    assert loss.item() == pytest.approx(5 * step, rel=1e-9)
+    loss.sum().backward()
+    assert grid.grad[1, 0, 0].item() == pytest.approx(0.6, rel=1e-9)
+
+
+def test_total_variation_beyond_float64_is_infinite_with_a_finite_gradient():
+    grid = torch.zeros(2, 2, 2, dtype=torch.float64)
+    grid[1, 0, 0] = grid[0, 1, 0] = torch.finfo(torch.float64).max
+    loss = total_variation_loss(grid.requires_grad_())
+    assert loss.item() == math.inf
+    loss.sum().backward()
+    assert grid.grad[1, 0, 0].item() == pytest.approx(math.sqrt(0.5))
+
+
 def test_sparsity_by_hand():
     loss = sparsity_loss(torch.tensor([0.0, 2.0, 1e30]), length=0.5)
     assert loss.tolist() == pytest.approx([0.0, 1.0 - math.exp(-1.0), 1.0])
@@ -58,6 +78,18 @@ def test_sparsity_by_hand():
 def test_depth_smoothness_by_hand():
     assert depth_smoothness_loss(torch.tensor([[1.0, 3.0], [5.0, 9.0]])).tolist() == [[16.0 + 4.0]]
     assert depth_smoothness_loss(torch.zeros(10, 8, 8)).shape == (10, 7, 7)
+
+
+def test_depths_of_any_size_and_of_rays_that_meet_nothing():
+    assert depth_smoothness_loss(torch.tensor([[1e20, 0.0], [0.0, 0.0]])).tolist() == [[pytest.approx(2e40, rel=1e-6)]]
+    assert depth_smoothness_loss(torch.tensor([[300.0, 0.0], [0.0, 0.0]], dtype=torch.float16)).tolist() == [[180000.0]]
+    depth = torch.tensor([[math.inf, math.inf, 1.0], [math.inf, 2.0, 5.0], [1.0, 1.0, 1.0]], requires_grad=True)
+    loss = depth_smoothness_loss(depth)
+    # the sky to the sky and to the wall: 0; the wall to itself: (1 - 2)^2 + (5 - 2)^2
+    assert loss.tolist() == [[0.0, 0.0], [0.0, 10.0]]
+    loss.sum().backward()
+    assert depth.grad.tolist() == [[0.0, 0.0, 0.0], [0.0, 2.0 - 6.0, 6.0], [0.0, -2.0, 0.0]]
+    assert depth_smoothness_loss(torch.tensor([[math.nan, 1.0], [1.0, 1.0]])).isnan().all()
 
 
 def test_distortion_by_hand_and_against_the_double_sum():
@@ -73,6 +105,13 @@ def test_distortion_by_hand_and_against_the_double_sum():
     np.testing.assert_allclose(distortion_loss(torch.from_numpy(w), torch.from_numpy(s)), slow, rtol=1e-12)
 
 
+def test_distortion_of_huge_edges_and_of_no_rays():
+    weights, edges = torch.full((1, 2), 0.5), torch.tensor([[0.0, 1e38, 3e38]])
+    # middles 5e37 and 2e38: twice .25 times 1.5e38, and .25 times the widths 1e38 and 2e38 over 3
+    assert distortion_loss(weights, edges).item() == pytest.approx(7.5e37 + 2.5e37, rel=1e-6)
+    assert distortion_loss(torch.zeros(0, 4), torch.zeros(0, 5)).shape == (0,)
+
+
 def test_free_space_by_hand():
     assert free_space_loss(torch.tensor([0.0, math.log(3.0), 1e30])).tolist() == pytest.approx([0.5, 0.75, 1.0])
 
@@ -86,6 +125,17 @@ def test_gradients_scale_with_the_square_of_the_distance_and_values_do_not():
         scaled.sum().backward()
     assert density.grad.tolist() == [0.0, 0.25, 1.0]
     assert colour.grad.tolist() == [[0.0] * 2, [0.25] * 2, [1.0] * 2]
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_scaled_gradients_in_half_precision(dtype):
+    """The square of .001 is subnormal in float16: three digits of it would be lost."""
+    values = torch.ones(2, dtype=dtype, requires_grad=True)
+    scaled = scale_gradients(values, torch.tensor([0.001, math.inf], dtype=dtype))
+    assert scaled.dtype == dtype
+    scaled.backward(torch.tensor([1000.0, 1.0], dtype=dtype))
+    assert values.grad.dtype == dtype
+    assert values.grad.tolist() == [pytest.approx(1e-3, rel=1e-2), 1.0]
 
 
 @pytest.mark.parametrize("how", ["clamp", "sigmoid"])
@@ -160,7 +210,14 @@ def test_half_precision_is_raised(dtype):
         (lambda: depth_smoothness_loss(torch.ones(4)), r"\(\.\.\., H, W\).*got \(4,\)"),
         (lambda: sparsity_loss(torch.ones(1), length=0.0), "length must be finite and > 0, got 0.0"),
         (lambda: distortion_loss(torch.ones(2, 3), torch.ones(2, 3)), r"edges must have shape \(2, 4\)"),
+        (lambda: distortion_loss(torch.ones(1, 2), torch.tensor([[0.0, 1.0, math.inf]])), "finite .*got 1 of 3.* inf"),
+        (lambda: distortion_loss(torch.ones(1, 2), torch.tensor([[0.0, math.nan, 1.0]])), "finite .*got 1 of 3.* nan"),
         (lambda: scale_gradients(torch.ones(3), torch.ones(2)), r"distance's shape \(2,\), got \(3,\)"),
+        (
+            lambda: scale_gradients(torch.ones(2), torch.tensor([1.0, math.nan])),
+            "distance must be >= 0, got 1 of 2.*nan",
+        ),
+        (lambda: scale_gradients(torch.ones(2), torch.tensor([-0.5, -1.0])), "distance must be >= 0, got 2 of 2.*-0.5"),
         (lambda: squash_density(torch.ones(1), threshold=0.0, how="clamp"), "threshold must be finite and > 0"),
         (lambda: squash_density(torch.ones(1), threshold=1.0, how="tanh"), 'how must be "clamp" or "sigmoid"'),
         (lambda: sds_loss(torch.ones(2, 3), torch.ones(3), alpha_cumprod=0.5), r"x0_pred must have shape \(2, 3\)"),
