@@ -127,7 +127,8 @@ class _ScaleGradient(torch.autograd.Function):
 def scale_gradients(values: Tensor, distance: Tensor) -> Tensor:
     """Floaters No More: the same values, their gradients times ``min(1, distance^2)``.
 
-    Samples near a camera are dense and get too much of the gradient.
+    Samples near a camera are dense and get too much of the gradient. The gradient is thus on purpose not that of the
+    values, and ``gradcheck`` fails wherever the distance is below 1.
 
     Args:
         values: ``(...)`` or ``(..., C)``: densities, colours.

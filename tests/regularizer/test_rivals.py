@@ -149,6 +149,23 @@ def test_the_squash_goes_through_the_three_points_of_the_paper(how):
     assert slope[3] == 0.0  # ... and flat: what the paper says is wrong with it
 
 
+def test_the_sigmoid_between_its_points_by_hand():
+    def scaled(d):  # logistic of six times the distance to the threshold, in [-1, 1] before it is rescaled
+        return 2.0 / (1.0 + math.exp(-6.0 * (d / 0.01 - 1.0))) - 1.0
+
+    density = torch.tensor([0.005, 0.015], dtype=torch.float64)
+    found = squash_density(density, threshold=0.01, how="sigmoid").tolist()
+    assert found == pytest.approx([-0.909647, 0.909647], abs=1e-6)
+    assert found == pytest.approx([scaled(0.005) / scaled(0.02), scaled(0.015) / scaled(0.02)], rel=1e-12)
+
+
+def test_sds_by_hand():
+    signed, x0_pred = torch.tensor([[1.0, -0.25], [0.5, 0.0]]), torch.tensor([[-0.5, -0.25], [1.0, 1.0]])
+    # sqrt(.36 * .64) = .48: half of it times 1.5^2 = 2.25 and 0; sqrt(.5 * .5) = .5: times .5^2 = .25 and 1
+    found = sds_loss(signed, x0_pred, alpha_cumprod=torch.tensor([0.36, 0.5]))
+    assert found.flatten().tolist() == pytest.approx([0.54, 0.0, 0.0625, 0.25])
+
+
 def test_sds_has_the_gradient_of_dreamfusion():
     """Against noise put in and predicted: w (eps_pred - eps)."""
     alpha = torch.from_numpy(alphas_cumprod()[[50, 600]])
@@ -168,12 +185,30 @@ def test_gradcheck():
     assert check(total_variation_loss, (uniform(2, 3, 3, 3),))
     assert check(lambda d: sparsity_loss(d, length=0.3), (uniform(5),))
     assert check(depth_smoothness_loss, (uniform(2, 4, 4),))
-    edges = uniform(3, 6).detach().sort(dim=1).values
+    edges = uniform(3, 6).detach().sort(dim=1).values.requires_grad_()
     assert check(distortion_loss, (uniform(3, 5), edges))
     assert check(free_space_loss, (uniform(5),))
     assert check(lambda d: squash_density(d, threshold=0.4, how="sigmoid"), (uniform(5),))
+    apart = torch.tensor([0.1, 0.3, 0.5, 0.7, 0.9, 3.0], dtype=torch.float64, requires_grad=True)  # kinks: 0 and .8
+    assert check(lambda d: squash_density(d, threshold=0.4, how="clamp"), (apart,))
     target = uniform(2, 5).detach()
     assert check(lambda x: sds_loss(x, target, alpha_cumprod=0.3), (uniform(2, 5),))
+
+
+def test_scaled_gradients_are_the_numeric_ones_times_the_scale():
+    """gradcheck cannot pass: the values are those of the identity, whose gradient is on purpose made smaller."""
+    values, distance = uniform(4, 3), torch.tensor([0.0, 0.3, 0.9, 2.0], dtype=torch.float64)
+
+    def outcome(v):
+        return (torch.sin(scale_gradients(v, distance)) ** 2).sum()
+
+    (found,) = torch.autograd.grad(outcome(values), values)
+    steps = 1e-6 * torch.eye(values.numel(), dtype=torch.float64).reshape(-1, *values.shape)
+    numeric = torch.stack([(outcome(values + step) - outcome(values - step)) / 2e-6 for step in steps]).reshape(4, 3)
+    scale = torch.tensor([0.0, 0.09, 0.81, 1.0], dtype=torch.float64)[:, None]
+    torch.testing.assert_close(found, numeric.detach() * scale, rtol=1e-6, atol=1e-9)
+    with pytest.raises(RuntimeError, match="Jacobian mismatch"):
+        torch.autograd.gradcheck(outcome, (values,))
 
 
 LOSSES = {
