@@ -41,8 +41,9 @@ def occupancy_from_signed(signed: Array) -> Array:
 
 
 def opacity_from_density(density: Array, pitch: Array | float) -> Array:
-    """``1 - exp(-density * pitch)``, exact for tiny optical depths (expm1), in [0, 1]."""
-    return -namespace(density).expm1(-density * pitch)
+    """``1 - exp(-density * pitch)``, exact for tiny optical depths (expm1), in [0, 1]; 1 for depths beyond floats."""
+    with np.errstate(over="ignore"):
+        return -namespace(density).expm1(-density * pitch)
 
 
 def signed_from_opacity(opacity: Array) -> Array:

@@ -116,6 +116,9 @@ def visibility_loss(density: Tensor, view_count: Tensor, *, min_views: int = 1) 
 def stable_mean(loss: Tensor, *, count: int | None = None) -> Tensor:
     """Mean that no finite loss can overflow: each term is divided before the sum, which runs in float64.
 
+    Where the mean is within rounding of the largest float64 it may become inf; its gradient is ``1 / count`` all the
+    same.
+
     Args:
         loss: ``(...)``.
         count: divide by this instead of the number of elements; >= 1.
@@ -146,7 +149,9 @@ def cubewise_mean(
         used: ``(N, R, R, R)`` bool: the mean is over these.
 
     Returns:
-        Scalar float64 (float32 on mps); exactly 0 where nothing is used. It can be differentiated once.
+        Scalar float64 (float32 on mps); exactly 0 where nothing is used. It can be differentiated once. The gradient is
+        finite wherever ``density`` is; the mean is inf where a ``density * factor`` is beyond 1.8e308 (3.4e38 on mps),
+        which only densities given in float64 can reach at a ``factor`` > 1.
     """
     result: Tensor = _CubewiseMean.apply(density, loss, x0_pred, factor, used)  # type: ignore[no-untyped-call]
     return result

@@ -90,6 +90,10 @@ def make_query(
         backend: what it takes; None to find out (:func:`find_backend`).
         chunk: most positions a call.
         caller: for errors.
+
+    Raises:
+        TypeError: from the query, what came back is no array or tensor of integers or floating-point numbers.
+        ValueError: from the query, it is of another shape.
     """
     if backend not in (None, "numpy", "torch"):
         raise ValueError(f"{caller}: backend must be None, 'numpy' or 'torch', got {backend!r}")
@@ -102,9 +106,17 @@ def make_query(
         for start in range(0, len(positions), chunk):
             part = positions[start : start + chunk]
             density = check_density_shape(_ask(density_fn, part, kind), part, caller=caller)
-            if is_tensor(density) and density.is_floating_point():
-                density = density.detach().double() if density.device.type != "mps" else density.detach().float()
-            values[start : start + chunk] = to_numpy(density)
+            values[start : start + chunk] = _real_numbers(density, caller=caller)
         return values
 
     return query
+
+
+def _real_numbers(density: Any, *, caller: str) -> NDArray[Any]:
+    """Densities as an array, bfloat16 raised, unless they are truth values, complex, text or objects."""
+    if is_tensor(density) and density.is_floating_point():
+        density = density.detach().double() if density.device.type != "mps" else density.detach().float()
+    values = to_numpy(density)
+    if values.dtype == np.bool_ or not np.can_cast(values.dtype, np.float64, "same_kind"):
+        raise TypeError(f"{caller}: density_fn must return integers or floating-point numbers, got {values.dtype}")
+    return values

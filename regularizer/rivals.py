@@ -1,7 +1,8 @@
 """What others add to the photometric loss against floaters: pure, unreduced, each after its source.
 
-All take and give tensors; half precision is raised to float32 as in :mod:`.losses`. Where a formula has a corner
-(the root of total variation at 0), the gradient there is 0, never NaN.
+All take and give tensors; half precision is raised to float32 as in :mod:`.losses`, and to float64 where squares or
+long sums need it; :func:`scale_gradients` alone gives back what it got. Where a formula has a corner (the root of
+total variation at 0), the gradient there is 0, never NaN.
 """
 
 from __future__ import annotations
@@ -30,19 +31,21 @@ def total_variation_loss(grid: Tensor) -> Tensor:
 
     Returns:
         ``(..., X - 1, Y - 1, Z - 1)`` float64 (float32 on mps): the differences are to the next voxel along each axis.
+        Finite up to 1e308; as no square is taken of more than 1, the gradient is finite wherever ``grid`` is.
 
     Raises:
         ValueError: fewer than three axes, or one shorter than 2.
     """
     if grid.ndim < 3 or min(grid.shape[-3:]) < 2:
         raise ValueError(f"total_variation_loss: grid must be (..., X, Y, Z) with sides >= 2, got {tuple(grid.shape)}")
-    values = widest(grid)  # the square of 1e20 is beyond float32
+    values = widest(grid)
     here = values[..., :-1, :-1, :-1]
     steps = torch.stack([values[..., 1:, :-1, :-1] - here, values[..., :-1, 1:, :-1] - here,
                          values[..., :-1, :-1, 1:] - here])  # fmt: skip
-    squares = (steps**2).sum(0)
-    flat = squares == 0
-    return torch.where(flat, squares, torch.sqrt(torch.where(flat, torch.ones_like(squares), squares)))
+    longest = steps.detach().abs().amax(0)
+    flat = longest == 0
+    unit = steps / torch.where(flat, torch.ones_like(longest), longest)
+    return longest * torch.sqrt(torch.where(flat, torch.ones_like(longest), (unit**2).sum(0)))
 
 
 def sparsity_loss(density: Tensor, *, length: float) -> Tensor:
@@ -61,26 +64,42 @@ def depth_smoothness_loss(depth: Tensor) -> Tensor:
     r"""RegNeRF, eq. 4: squared differences of expected depth within patches of rays from unseen views.
 
     Args:
-        depth: ``(..., H, W)``, sides >= 2; the paper's patches have 8 x 8 rays.
+        depth: ``(..., H, W)``, sides >= 2, scene units; the paper's patches have 8 x 8 rays. A ray that meets nothing
+            (inf) has no depth to compare: the difference to its neighbours is 0, and so is the gradient.
 
     Returns:
-        ``(..., H - 1, W - 1)``: down plus across.
+        ``(..., H - 1, W - 1)`` float64 (float32 on mps): down plus across. Finite for depths up to 1e153 (1e18).
     """
     if depth.ndim < 2 or min(depth.shape[-2:]) < 2:
         raise ValueError(f"depth_smoothness_loss: depth must be (..., H, W), sides >= 2, got {tuple(depth.shape)}")
-    values = upcast(depth)
-    here = values[..., :-1, :-1]
-    return (values[..., 1:, :-1] - here) ** 2 + (values[..., :-1, 1:] - here) ** 2
+    endless = torch.isinf(depth)
+    values = widest(torch.where(endless, torch.zeros_like(depth), depth))
+    down = torch.where(endless[..., 1:, :-1] | endless[..., :-1, :-1], 0.0, values.diff(dim=-2)[..., :-1])
+    across = torch.where(endless[..., :-1, 1:] | endless[..., :-1, :-1], 0.0, values.diff(dim=-1)[..., :-1, :])
+    return down**2 + across**2
 
 
 def distortion_loss(weights: Tensor, edges: Tensor) -> Tensor:
     """mip-NeRF 360, eq. 15, a ray: see :func:`unghost.core.distortion.distortion`.
 
     Args:
-        weights: ``(..., S)``.
-        edges: ``(..., S + 1)``, ascending; squash distances to [0, 1] first (the paper by ``t / (1 + t)``-like maps).
+        weights: ``(..., S)`` in [0, 1], adding up to at most 1.
+        edges: ``(..., S + 1)``, finite, ascending; squash distances to [0, 1] first (the paper by ``t / (1 + t)``-like
+            maps, which take an endless last sample to 1).
+
+    Returns:
+        ``(...)`` float64 (float32 on mps), differentiable in both.
+
+    Raises:
+        ValueError: shapes that do not fit; an edge that is infinite or NaN.
     """
-    spread: Tensor = distortion(upcast(weights), upcast(edges))
+    finite = torch.isfinite(edges)
+    if not bool(finite.all()):
+        raise ValueError(
+            f"distortion_loss: edges must be finite (squash distances first), got {int((~finite).sum())} of "
+            f"{edges.numel()} that are not; first {edges[~finite][0].item():g}"
+        )
+    spread: Tensor = distortion(widest(weights), widest(edges))
     return spread
 
 
@@ -102,24 +121,38 @@ class _ScaleGradient(torch.autograd.Function):
     @staticmethod
     def backward(ctx: torch.autograd.function.FunctionCtx, *gradients: Tensor) -> tuple[Tensor, None]:
         (scale,) = ctx.saved_tensors  # type: ignore[attr-defined]
-        return gradients[0] * scale, None
+        return (gradients[0] * scale).to(gradients[0].dtype), None
 
 
 def scale_gradients(values: Tensor, distance: Tensor) -> Tensor:
     """Floaters No More: the same values, their gradients times ``min(1, distance^2)``.
 
-    Samples near a camera are dense and get too much of the gradient.
+    Samples near a camera are dense and get too much of the gradient. The gradient is thus on purpose not that of the
+    values, and ``gradcheck`` fails wherever the distance is below 1.
 
     Args:
         values: ``(...)`` or ``(..., C)``: densities, colours.
-        distance: ``(...)`` >= 0 from the ray's camera, in units in which 1 is the far side of "near".
+        distance: ``(...)`` >= 0, inf too, from the ray's camera, in units in which 1 is the far side of "near".
+
+    Returns:
+        ``values``, of their own dtype, as their gradient is; the factor is worked out in float32 at least.
+
+    Raises:
+        ValueError: shapes that do not fit; distances that are NaN or negative.
     """
     if values.shape[: distance.ndim] != distance.shape:
         raise ValueError(
             f"scale_gradients: values must begin with distance's shape {tuple(distance.shape)}, "
             f"got {tuple(values.shape)}"
         )
-    scale = distance.detach().clamp(min=0.0, max=1.0) ** 2
+    far = upcast(distance.detach())
+    valid = far >= 0
+    if not bool(valid.all()):
+        raise ValueError(
+            f"scale_gradients: distance must be >= 0, got {int((~valid).sum())} of {far.numel()} that are not; "
+            f"first {far[~valid][0].item():g}"
+        )
+    scale = far.clamp(max=1.0) ** 2
     wide = scale.reshape(*scale.shape, *[1] * (values.ndim - scale.ndim))
     scaled: Tensor = _ScaleGradient.apply(values, wide)  # type: ignore[no-untyped-call]
     return scaled

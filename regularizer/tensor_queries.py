@@ -31,20 +31,14 @@ def query_tensors(field: DensityFn, positions: Tensor, *, chunk: int, drop_inval
 
     Raises:
         TypeError: no tensor of floating-point numbers.
-        ValueError: of another shape; or NaN, infinite or negative, unless dropping.
+        ValueError: of another shape or on another device; or NaN, infinite or negative, unless dropping.
 
     Warns:
         UserWarning: gradients are wanted, and the densities have none.
     """
     if len(positions) == 0:
         return positions.new_zeros(0), torch.ones(0, dtype=torch.bool, device=positions.device)
-    parts = []
-    for part in torch.split(positions, chunk):
-        density = field(part)
-        if not isinstance(density, Tensor):
-            raise TypeError(f"DensityRegularizer: density_fn must return a torch tensor, got {type(density).__name__}")
-        parts.append(upcast(check_density_shape(density, part, caller="DensityRegularizer")))
-    values = torch.cat(parts)
+    values = torch.cat([_as_densities(field(part), part) for part in torch.split(positions, chunk)])
     if torch.is_grad_enabled() and not values.requires_grad:
         warnings.warn(WITHOUT_GRADIENT, stacklevel=2)
     if not drop_invalid:
@@ -52,3 +46,17 @@ def query_tensors(field: DensityFn, positions: Tensor, *, chunk: int, drop_inval
         return values, torch.ones_like(values, dtype=torch.bool)
     valid = torch.isfinite(values.detach()) & (values.detach() >= 0)
     return torch.where(valid, values, torch.zeros_like(values)), valid
+
+
+def _as_densities(density: Any, positions: Tensor) -> Tensor:
+    """What a callable returned for ``positions (M, 3)``, as ``(M,)``, at least float32, or an error that names it."""
+    if not isinstance(density, Tensor):
+        raise TypeError(f"DensityRegularizer: density_fn must return a torch tensor, got {type(density).__name__}")
+    if not density.is_floating_point():
+        raise TypeError(f"DensityRegularizer: density_fn must return floating-point densities, got {density.dtype}")
+    if density.device != positions.device:
+        raise ValueError(
+            f"DensityRegularizer: density_fn must return densities on the device of its positions, "
+            f"{positions.device}, got {density.device}"
+        )
+    return upcast(check_density_shape(density, positions, caller="DensityRegularizer"))

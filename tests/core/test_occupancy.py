@@ -37,6 +37,7 @@ def test_opacity_by_hand():
     assert opacity_from_density(np.array([np.log(2.0) / 0.5]), 0.5)[0] == pytest.approx(0.5)
     assert opacity_from_density(np.array([1e-12]), 1.0)[0] == pytest.approx(1e-12, rel=1e-12)  # expm1, not 1 - exp
     assert opacity_from_density(np.array([1e30]), 1.0)[0] == 1.0
+    assert opacity_from_density(np.array([1e308]), 1e3)[0] == 1.0  # without a warning
     opacity = np.linspace(0, 1, 11)
     np.testing.assert_allclose(opacity_from_signed(signed_from_opacity(opacity)), opacity, atol=1e-15)
 

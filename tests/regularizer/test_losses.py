@@ -136,3 +136,16 @@ def test_the_mean_cube_by_cube_passes_gradcheck():
     assert torch.autograd.gradcheck(
         lambda values: cubewise_mean(loss, values, x0_pred, factor, torch.ones(2, 3, 3, 3, dtype=torch.bool)), density
     )
+
+
+@pytest.mark.parametrize("answer", [-1.0, 1.0])
+@pytest.mark.parametrize(("value", "finite"), [(1e300, True), (1e308, False)])
+def test_depths_beyond_float64_are_an_infinite_loss_with_a_finite_gradient(value, finite, answer):
+    density = torch.full((1, 2, 2, 2), value, dtype=torch.float64, requires_grad=True)
+    factor = torch.full((1, 1, 1, 1), 10.0, dtype=torch.float64)
+    loss = functools.partial(dsds_loss, target_density=0.1)
+    x0_pred = torch.full((1, 2, 2, 2), answer)
+    found = cubewise_mean(loss, density, x0_pred, factor, torch.ones(1, 2, 2, 2, dtype=torch.bool))
+    assert found.item() == pytest.approx((10.0 * value if finite else float("inf")) if answer < 0 else 0.0)
+    found.backward()
+    assert density.grad.flatten().tolist() == pytest.approx([10.0 / 8 if answer < 0 else 0.0] * 8)

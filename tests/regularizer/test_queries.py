@@ -1,3 +1,5 @@
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -38,6 +40,37 @@ def test_tensors_of_any_precision_come_back_as_float64(dtype):
     values = make_query(fn, place=PLACE, chunk=3, caller="f")(np.full((10, 3), 0.5))
     assert values.dtype == np.float64
     assert values.tolist() == [1.0] * 10
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int64, np.float16, np.longdouble])
+@pytest.mark.parametrize("backend", ["numpy", "torch"])
+def test_integers_and_all_floating_point_numbers_are_densities(dtype, backend):
+    def fn(p):
+        made = np.full(len(p), 3, dtype=dtype)
+        return torch.from_numpy(made) if backend == "torch" and dtype is not np.longdouble else made
+
+    values = make_query(fn, place=PLACE, backend=backend, caller="f")(np.zeros((2, 3)))
+    assert values.dtype == np.float64
+    assert values.tolist() == [3.0, 3.0]
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        np.ones(2, dtype=complex),
+        np.ones(2, dtype=bool),
+        np.array(["1.0", "2.0"]),
+        np.array([1.0, None], dtype=object),
+        np.ones(2, dtype="timedelta64[s]"),
+        torch.ones(2, dtype=torch.complex64),
+        torch.ones(2, dtype=torch.bool),
+    ],
+    ids=lambda made: str(made.dtype),
+)
+def test_what_is_no_number_is_named(made):
+    rule = "f: density_fn must return integers or floating-point numbers, got "
+    with pytest.raises(TypeError, match=re.escape(rule + str(made.dtype).removeprefix("torch."))):
+        make_query(lambda p: made, place=PLACE, backend="numpy", caller="f")(np.zeros((2, 3)))
 
 
 def test_chunks_are_bounded_and_empty_queries_ask_nothing():

@@ -255,6 +255,11 @@ def test_what_a_callable_may_not_return(kit, aabb):
         regularizer(lambda p: p.sum())
     with pytest.raises(TypeError, match="must return a torch tensor, got ndarray"):
         regularizer(lambda p: np.zeros(len(p)))
+    with pytest.raises(ValueError, match=r"DensityRegularizer: .* on the device of its positions, cpu, got meta"):
+        regularizer(lambda p: torch.empty(len(p), device="meta"))
+    for dtype in (torch.int64, torch.bool, torch.complex64):
+        with pytest.raises(TypeError, match=rf"DensityRegularizer: .* floating-point densities, got {dtype}$"):
+            regularizer(lambda p, dtype=dtype: torch.ones(len(p), dtype=dtype))
     with pytest.raises(TypeError, match="must be callable, got float"):
         regularizer(3.0)
     with pytest.raises(ValueError, match="non-empty list"):

@@ -49,6 +49,26 @@ def test_total_variation_has_a_gradient_where_nothing_changes():
     assert grid.grad.abs().max() == 0.0
 
 
+@pytest.mark.parametrize("step", [1e-310, 1e-200, 1e160, 1e307])
+def test_total_variation_takes_no_square_of_what_has_none(step):
+    grid = torch.zeros(2, 2, 2, dtype=torch.float64)
+    grid[1, 0, 0], grid[0, 1, 0] = 3 * step, 4 * step
+    grid.requires_grad_()
+    loss = total_variation_loss(grid)
+    assert loss.item() == pytest.approx(5 * step, rel=1e-9)
+    loss.sum().backward()
+    assert grid.grad[1, 0, 0].item() == pytest.approx(0.6, rel=1e-9)
+
+
+def test_total_variation_beyond_float64_is_infinite_with_a_finite_gradient():
+    grid = torch.zeros(2, 2, 2, dtype=torch.float64)
+    grid[1, 0, 0] = grid[0, 1, 0] = torch.finfo(torch.float64).max
+    loss = total_variation_loss(grid.requires_grad_())
+    assert loss.item() == math.inf
+    loss.sum().backward()
+    assert grid.grad[1, 0, 0].item() == pytest.approx(math.sqrt(0.5))
+
+
 def test_sparsity_by_hand():
     loss = sparsity_loss(torch.tensor([0.0, 2.0, 1e30]), length=0.5)
     assert loss.tolist() == pytest.approx([0.0, 1.0 - math.exp(-1.0), 1.0])
@@ -58,6 +78,18 @@ def test_sparsity_by_hand():
 def test_depth_smoothness_by_hand():
     assert depth_smoothness_loss(torch.tensor([[1.0, 3.0], [5.0, 9.0]])).tolist() == [[16.0 + 4.0]]
     assert depth_smoothness_loss(torch.zeros(10, 8, 8)).shape == (10, 7, 7)
+
+
+def test_depths_of_any_size_and_of_rays_that_meet_nothing():
+    assert depth_smoothness_loss(torch.tensor([[1e20, 0.0], [0.0, 0.0]])).tolist() == [[pytest.approx(2e40, rel=1e-6)]]
+    assert depth_smoothness_loss(torch.tensor([[300.0, 0.0], [0.0, 0.0]], dtype=torch.float16)).tolist() == [[180000.0]]
+    depth = torch.tensor([[math.inf, math.inf, 1.0], [math.inf, 2.0, 5.0], [1.0, 1.0, 1.0]], requires_grad=True)
+    loss = depth_smoothness_loss(depth)
+    # the sky to the sky and to the wall: 0; the wall to itself: (1 - 2)^2 + (5 - 2)^2
+    assert loss.tolist() == [[0.0, 0.0], [0.0, 10.0]]
+    loss.sum().backward()
+    assert depth.grad.tolist() == [[0.0, 0.0, 0.0], [0.0, 2.0 - 6.0, 6.0], [0.0, -2.0, 0.0]]
+    assert depth_smoothness_loss(torch.tensor([[math.nan, 1.0], [1.0, 1.0]])).isnan().all()
 
 
 def test_distortion_by_hand_and_against_the_double_sum():
@@ -71,6 +103,13 @@ def test_distortion_by_hand_and_against_the_double_sum():
     slow += (w**2 * np.diff(s)).sum(1) / 3
     np.testing.assert_allclose(distortion(w, s), slow, rtol=1e-12)
     np.testing.assert_allclose(distortion_loss(torch.from_numpy(w), torch.from_numpy(s)), slow, rtol=1e-12)
+
+
+def test_distortion_of_huge_edges_and_of_no_rays():
+    weights, edges = torch.full((1, 2), 0.5), torch.tensor([[0.0, 1e38, 3e38]])
+    # middles 5e37 and 2e38: twice .25 times 1.5e38, and .25 times the widths 1e38 and 2e38 over 3
+    assert distortion_loss(weights, edges).item() == pytest.approx(7.5e37 + 2.5e37, rel=1e-6)
+    assert distortion_loss(torch.zeros(0, 4), torch.zeros(0, 5)).shape == (0,)
 
 
 def test_free_space_by_hand():
@@ -88,6 +127,17 @@ def test_gradients_scale_with_the_square_of_the_distance_and_values_do_not():
     assert colour.grad.tolist() == [[0.0] * 2, [0.25] * 2, [1.0] * 2]
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_scaled_gradients_in_half_precision(dtype):
+    """The square of .001 is subnormal in float16: three digits of it would be lost."""
+    values = torch.ones(2, dtype=dtype, requires_grad=True)
+    scaled = scale_gradients(values, torch.tensor([0.001, math.inf], dtype=dtype))
+    assert scaled.dtype == dtype
+    scaled.backward(torch.tensor([1000.0, 1.0], dtype=dtype))
+    assert values.grad.dtype == dtype
+    assert values.grad.tolist() == [pytest.approx(1e-3, rel=1e-2), 1.0]
+
+
 @pytest.mark.parametrize("how", ["clamp", "sigmoid"])
 def test_the_squash_goes_through_the_three_points_of_the_paper(how):
     density = torch.tensor([0.0, 0.01, 0.02, 10.0], dtype=torch.float64, requires_grad=True)
@@ -97,6 +147,23 @@ def test_the_squash_goes_through_the_three_points_of_the_paper(how):
     (slope,) = torch.autograd.grad(signed.sum(), density)
     assert slope[1] > 50.0  # steep ...
     assert slope[3] == 0.0  # ... and flat: what the paper says is wrong with it
+
+
+def test_the_sigmoid_between_its_points_by_hand():
+    def scaled(d):  # logistic of six times the distance to the threshold, in [-1, 1] before it is rescaled
+        return 2.0 / (1.0 + math.exp(-6.0 * (d / 0.01 - 1.0))) - 1.0
+
+    density = torch.tensor([0.005, 0.015], dtype=torch.float64)
+    found = squash_density(density, threshold=0.01, how="sigmoid").tolist()
+    assert found == pytest.approx([-0.909647, 0.909647], abs=1e-6)
+    assert found == pytest.approx([scaled(0.005) / scaled(0.02), scaled(0.015) / scaled(0.02)], rel=1e-12)
+
+
+def test_sds_by_hand():
+    signed, x0_pred = torch.tensor([[1.0, -0.25], [0.5, 0.0]]), torch.tensor([[-0.5, -0.25], [1.0, 1.0]])
+    # sqrt(.36 * .64) = .48: half of it times 1.5^2 = 2.25 and 0; sqrt(.5 * .5) = .5: times .5^2 = .25 and 1
+    found = sds_loss(signed, x0_pred, alpha_cumprod=torch.tensor([0.36, 0.5]))
+    assert found.flatten().tolist() == pytest.approx([0.54, 0.0, 0.0625, 0.25])
 
 
 def test_sds_has_the_gradient_of_dreamfusion():
@@ -118,12 +185,30 @@ def test_gradcheck():
     assert check(total_variation_loss, (uniform(2, 3, 3, 3),))
     assert check(lambda d: sparsity_loss(d, length=0.3), (uniform(5),))
     assert check(depth_smoothness_loss, (uniform(2, 4, 4),))
-    edges = uniform(3, 6).detach().sort(dim=1).values
+    edges = uniform(3, 6).detach().sort(dim=1).values.requires_grad_()
     assert check(distortion_loss, (uniform(3, 5), edges))
     assert check(free_space_loss, (uniform(5),))
     assert check(lambda d: squash_density(d, threshold=0.4, how="sigmoid"), (uniform(5),))
+    apart = torch.tensor([0.1, 0.3, 0.5, 0.7, 0.9, 3.0], dtype=torch.float64, requires_grad=True)  # kinks: 0 and .8
+    assert check(lambda d: squash_density(d, threshold=0.4, how="clamp"), (apart,))
     target = uniform(2, 5).detach()
     assert check(lambda x: sds_loss(x, target, alpha_cumprod=0.3), (uniform(2, 5),))
+
+
+def test_scaled_gradients_are_the_numeric_ones_times_the_scale():
+    """gradcheck cannot pass: the values are those of the identity, whose gradient is on purpose made smaller."""
+    values, distance = uniform(4, 3), torch.tensor([0.0, 0.3, 0.9, 2.0], dtype=torch.float64)
+
+    def outcome(v):
+        return (torch.sin(scale_gradients(v, distance)) ** 2).sum()
+
+    (found,) = torch.autograd.grad(outcome(values), values)
+    steps = 1e-6 * torch.eye(values.numel(), dtype=torch.float64).reshape(-1, *values.shape)
+    numeric = torch.stack([(outcome(values + step) - outcome(values - step)) / 2e-6 for step in steps]).reshape(4, 3)
+    scale = torch.tensor([0.0, 0.09, 0.81, 1.0], dtype=torch.float64)[:, None]
+    torch.testing.assert_close(found, numeric.detach() * scale, rtol=1e-6, atol=1e-9)
+    with pytest.raises(RuntimeError, match="Jacobian mismatch"):
+        torch.autograd.gradcheck(outcome, (values,))
 
 
 LOSSES = {
@@ -160,7 +245,14 @@ def test_half_precision_is_raised(dtype):
         (lambda: depth_smoothness_loss(torch.ones(4)), r"\(\.\.\., H, W\).*got \(4,\)"),
         (lambda: sparsity_loss(torch.ones(1), length=0.0), "length must be finite and > 0, got 0.0"),
         (lambda: distortion_loss(torch.ones(2, 3), torch.ones(2, 3)), r"edges must have shape \(2, 4\)"),
+        (lambda: distortion_loss(torch.ones(1, 2), torch.tensor([[0.0, 1.0, math.inf]])), "finite .*got 1 of 3.* inf"),
+        (lambda: distortion_loss(torch.ones(1, 2), torch.tensor([[0.0, math.nan, 1.0]])), "finite .*got 1 of 3.* nan"),
         (lambda: scale_gradients(torch.ones(3), torch.ones(2)), r"distance's shape \(2,\), got \(3,\)"),
+        (
+            lambda: scale_gradients(torch.ones(2), torch.tensor([1.0, math.nan])),
+            "distance must be >= 0, got 1 of 2.*nan",
+        ),
+        (lambda: scale_gradients(torch.ones(2), torch.tensor([-0.5, -1.0])), "distance must be >= 0, got 2 of 2.*-0.5"),
         (lambda: squash_density(torch.ones(1), threshold=0.0, how="clamp"), "threshold must be finite and > 0"),
         (lambda: squash_density(torch.ones(1), threshold=1.0, how="tanh"), 'how must be "clamp" or "sigmoid"'),
         (lambda: sds_loss(torch.ones(2, 3), torch.ones(3), alpha_cumprod=0.5), r"x0_pred must have shape \(2, 3\)"),
