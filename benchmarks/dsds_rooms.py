@@ -49,8 +49,8 @@ WAYS: dict[str, dict[str, Any] | None] = {
     "fine-tuned alone": None,
     "visibility": {"dsds_weight": 0.0},
     "dsds": {},
-    "dsds, the paper's thresholds": {"threshold": 0.0, "fill_threshold": 0.0, "target": RULE.threshold},
-    "dsds, nothing filled": {"fill_threshold": 1.0},
+    "dsds, the paper's thresholds": {"threshold": 0.0, "fill_threshold": 0.0},
+    "dsds, target .3": {"target": 0.3},
     "dsds, target .9": {"target": 0.9},
     "dsds, views": {"denoiser": "views"},
 }

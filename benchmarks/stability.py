@@ -27,7 +27,7 @@ from unghost.regularizer.visibility import ViewCounter
 
 BOX = np.array([[-1.0] * 3, [1.0] * 3])
 PITCH = 0.0625
-TARGET = -math.log1p(-0.3)  # by hand: up to which is filled by default
+TARGET = -math.log1p(-0.1)  # by hand: up to which is filled by default
 LARGEST = float(np.finfo(np.float32).max)
 
 

@@ -16,7 +16,6 @@ from .visibility import PointKind
 Timestep = int | Callable[[int], int] | None
 
 SURE = 0.9  # score from which a voxel is filled
-FILLED = 0.3  # opacity up to which
 
 
 @dataclass(frozen=True)
@@ -36,8 +35,8 @@ class RegularizerSettings:
         fill_threshold: ``x0_pred`` at or above it is filled (0: the paper); what lies between the two is left alone.
             None for .9, or ``threshold`` if higher.
         target: ``w`` of eq. 2, up to which it is filled: an opacity of a field cell in (0, 1), or a density > 0 under
-            the density rule, at or above the rule's threshold. None for .3 under the opacity rule (more closes more
-            holes, and fog may set), and for the threshold itself (the paper) under the density rule.
+            the density rule, at or above the rule's threshold. None for that threshold (the paper): what is filled
+            then never counts as occupied, so nothing grows from it. With more holes close, and a capture's fog sets.
         dsds_weight, visibility_weight: factors of the losses; 0 switches one off, its queries too. Under the
             opacity rule the losses are optical depths per cell, so the weights do not depend on the scene's unit.
         visibility_samples: points a step for the visibility loss.
@@ -117,9 +116,7 @@ class RegularizerSettings:
 
     def target_density(self) -> float:
         """``w`` as the loss takes it: an optical depth of a cell, under the density rule a density."""
-        target = self.target
-        if target is None:
-            target = max(FILLED, self.rule.threshold) if self.rule.kind == "opacity" else self.rule.threshold
+        target = self.rule.threshold if self.target is None else self.target
         return target if self.rule.kind == "density" else -math.log1p(-target)
 
     @classmethod

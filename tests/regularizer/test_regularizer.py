@@ -68,7 +68,7 @@ def test_filling_by_hand(kit, aabb):
 @pytest.mark.parametrize(
     ("settings", "expected"),
     [
-        ({}, -math.log(0.7)),
+        ({}, -math.log(0.9)),
         ({"rule": OccupancyRule("opacity", 0.95)}, -math.log(0.05)),
         ({"target": 0.5}, math.log(2)),
         ({"rule": OccupancyRule.paper()}, 0.01),
@@ -309,7 +309,7 @@ def test_thresholds_come_from_the_manifest_and_can_be_set(kit, aabb):
 
 @pytest.mark.parametrize(
     ("score", "expected"),
-    [(-0.71, 0.1), (-0.69, 0.0), (0.89, 0.0), (0.91, -math.log(0.7) - 0.1)],
+    [(-0.71, 0.1), (-0.69, 0.0), (0.89, 0.0), (0.91, -math.log(0.9) - 0.1)],
 )
 def test_only_what_is_sure_moves(kit, aabb, score, expected):
     regularizer, _ = build(kit, aabb, lambda c: np.full_like(c, score), skip_empty=False)
