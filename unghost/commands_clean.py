@@ -28,6 +28,7 @@ def clean(
     strength: float = 0.5,
     resolution: int | None = None,
     reach: float | None = None,
+    scores_only: bool = False,
     threads: Threads = 0,
 ) -> None:
     """Clean a density grid (.npz: density (X, Y, Z) per scene unit, aabb (2, 3), cubic cells) or 3D Gaussians (.ply).
@@ -50,6 +51,7 @@ def clean(
         resolution: of splats, cells along the longest side of the box; by the splats' sizes if not given.
         reach: of splats, how many times the scene's core (98 % of the opacity) is cleaned (twice if not given); what
             is beyond stays.
+        scores_only: of splats, write all of them with their keep_score, and remove none.
         threads: of onnxruntime; 0 leaves the choice to it.
     """
     from .regularizer.keep_mask import KeepMask
@@ -58,8 +60,10 @@ def clean(
     target = None if preview else out or source.with_name(f"{source.stem}-clean{source.suffix}")
     keep = None if preview or (mask and keep is None) else keep or source.with_name(f"{source.stem}-keep.npz")
     _check_distinct(source=source, out=target, keep=keep, preview=preview, mask=mask)
-    if not splats and (resolution is not None or reach is not None):
-        raise ValueError(f"clean: --resolution and --reach are for splats (.ply); {source.name} has its own cells")
+    if not splats and (resolution is not None or reach is not None or scores_only):
+        raise ValueError(
+            f"clean: --resolution, --reach and --scores-only are for splats (.ply); {source.name} is a grid"
+        )
     boxes = [[box[:3], box[3:]] for box in keep_box]
     options: dict[str, Any]
     if mask is not None:
@@ -68,6 +72,7 @@ def clean(
         options = {"keep_boxes": tuple(boxes), **_judging(denoiser, threads, strength, cameras)}
         options |= {"resolution": resolution} if splats else {}
         options |= {} if reach is None else {"reach": reach}
+    options |= {"scores_only": scores_only} if splats else {}
     found, density_fn = (_clean_splats if splats else _clean_grid)(source, target, **options)
     if preview:
         from .removal_preview import region_table, write_preview

@@ -100,12 +100,13 @@ def clean_splats(
     return CleanedSplats(scores, scores >= KEPT_FROM, mask, field)
 
 
-def clean_ply(source: Path, target: Path | None, **options: Any) -> CleanedSplats:
+def clean_ply(source: Path, target: Path | None, *, scores_only: bool = False, **options: Any) -> CleanedSplats:
     """Clean a 3DGS ``.ply``: the kept rows, byte for byte, and their ``keep_score`` as one more property.
 
     Args:
         source: the file; it is not changed.
         target: another; None to write nothing.
+        scores_only: write all rows, to decide later.
         **options: of :func:`clean_splats`.
 
     Raises:
@@ -116,5 +117,5 @@ def clean_ply(source: Path, target: Path | None, **options: Any) -> CleanedSplat
         raise ValueError(f"clean: {target} is the file to clean; write to another")
     found = clean_splats(splats.gaussians(), **options)
     if target is not None:
-        write_splat_ply(target, splats, keep=found.keep, keep_score=found.keep_score)
+        write_splat_ply(target, splats, keep=found.keep | scores_only, keep_score=found.keep_score)
     return found

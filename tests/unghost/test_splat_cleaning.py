@@ -140,8 +140,28 @@ def test_folders_are_made(scene, tmp_path):
 def test_never_onto_itself_and_nothing_half_written(scene, tmp_path, capsys):
     with pytest.raises(ValueError, match="is the file to clean; write to another"):
         clean_ply(scene, scene)
-    bad = tmp_path / "bad.ply"
-    bad.write_bytes(scene.read_bytes()[:-7])
-    assert cli.main(["clean", str(bad)]) == 2
-    assert "unghost clean: " in capsys.readouterr().err
-    assert [path.name for path in tmp_path.iterdir()] == ["bad.ply"]
+    nan = np.float32(np.nan).tobytes()
+    whole, bad = scene.read_bytes(), tmp_path / "bad.ply"
+    for content, message in (
+        (whole[:-7], "bad.ply"),
+        (whole[:-8] + nan + whole[-4:], "finite"),
+        (whole.replace(b"property float opacity", b"property float opaquely"), "opacity"),
+        (b"\x89PNG\r\n\x1a\n" + whole, "bad.ply"),
+        (b"", "bad.ply"),
+    ):
+        bad.write_bytes(content)
+        assert cli.main(["clean", str(bad)]) == 2
+        error = capsys.readouterr().err
+        assert error.startswith("unghost clean: ")
+        assert message in error
+        assert [path.name for path in tmp_path.iterdir()] == ["bad.ply"]
+
+
+def test_scores_alone(scene, tmp_path):
+    assert cli.main(["clean", str(scene), "-o", str(tmp_path / "all.ply"), "--scores-only", "--keep",
+                     str(tmp_path / "k.npz")]) == 0  # fmt: skip
+    before, after = read_splat_ply(scene).rows, read_splat_ply(tmp_path / "all.ply").rows
+    assert (after[list(before.dtype.names)].astype(before.dtype) == before).all()
+    ghost, score = np.asarray(before["made_as"]) == 1, np.asarray(after["keep_score"])
+    assert (score[ghost] < 0.5).mean() > 0.8
+    assert (score[~ghost] >= 0.5).mean() > 0.95
