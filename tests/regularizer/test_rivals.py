@@ -5,12 +5,9 @@ import math
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from unghost.core.distortion import distortion
 from unghost.core.schedule import alphas_cumprod
-from unghost.regularizer.losses import stable_mean
 from unghost.regularizer.rivals import (
     depth_smoothness_loss,
     distortion_loss,
@@ -23,7 +20,6 @@ from unghost.regularizer.rivals import (
 )
 
 RNG = torch.Generator().manual_seed(0)
-EXTREMES = [0.0, 1e-45, 1e-30, 1.0, 1e30, 3e38]
 
 
 def uniform(*shape, low=0.0, high=1.0):
@@ -218,16 +214,6 @@ LOSSES = {
     "clamp": lambda d: squash_density(d, threshold=0.01, how="clamp"),
     "sigmoid": lambda d: squash_density(d, threshold=0.01, how="sigmoid"),
 }
-
-
-@settings(max_examples=40, deadline=None)
-@given(values=st.lists(st.sampled_from(EXTREMES), min_size=27, max_size=27), name=st.sampled_from(sorted(LOSSES)))
-def test_finite_densities_give_finite_losses_and_gradients(values, name):
-    density = torch.tensor(values, dtype=torch.float32).reshape(3, 3, 3).requires_grad_()
-    loss = stable_mean(LOSSES[name](density))
-    assert torch.isfinite(loss)
-    loss.backward()
-    assert torch.isfinite(density.grad).all()
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
