@@ -70,7 +70,7 @@ class Options:
         out: where dsds_rooms.json goes.
     """
 
-    rooms: tuple[int, ...] = (7, 8, 9, 10, 11, 12)
+    rooms: tuple[int, ...] = (7, 8, 9, 10)
     seed: int = 777
     resolution: int = 96
     fit_steps: int = 450
