@@ -85,13 +85,15 @@ def empty_rows(room: Room, options: Options) -> list[dict[str, Any]]:
     denoiser, field = load_denoiser(threads=options.threads), grid_density_fn(room.density, AABB)
     box = np.array(AABB)
     longer = np.stack([box[0], [2 * box[1, 0] - box[0, 0], *box[1, 1:]]])
-    ways = {"the room": (box, True), "the room, nothing skipped": (box, False), "a box twice as long": (longer, True)}
+    every: dict[str, Any] = {"skip_empty": False, "probe": 1}
+    ways = {"the room": (box, {}), "the room, nothing skipped": (box, every), "a box twice as long": (longer, {}),
+            "a box twice as long, nothing skipped": (longer, every)}  # fmt: skip
     rows: list[dict[str, Any]] = []
     places, kept = cell_centers(AABB, SHAPE), dict[str, Any]()
-    for method, (aabb, skip) in ways.items():
+    for method, (aabb, settings) in ways.items():
 
-        def work(aabb: Any = aabb, skip: bool = skip) -> Any:
-            return clean(field, aabb, denoiser=denoiser, field_pitch=room.pitch, skip_empty=skip)
+        def work(aabb: Any = aabb, settings: Any = settings) -> Any:
+            return clean(field, aabb, denoiser=denoiser, field_pitch=room.pitch, **settings)
 
         seconds, mask = median_seconds(work, options.repeats)
         kept[method] = np.asarray(mask.keep(places))
@@ -101,6 +103,7 @@ def empty_rows(room: Room, options: Options) -> list[dict[str, Any]]:
                 "seconds": seconds,
                 "times_the_room": seconds / rows[0]["seconds"] if rows else 1.0,
                 "windows": mask.details["windows"],
+                "asked": mask.details["asked"],
                 "cells_that_differ": float((kept[method] != kept["the room"]).mean()),
             }
         )
@@ -158,7 +161,7 @@ def memory_rows() -> list[dict[str, Any]]:
             process.start()
             megabytes = ours.recv()
             process.join()
-            rows.append({"method": f"memory, {what}", "cameras": count, "megabytes": megabytes})
+            rows.append({"method": f"memory, {what}", "cameras": count, "peak_megabytes": megabytes})
             say(f"{what}, {count} cameras: {megabytes:.0f} MB")
     return rows
 

@@ -13,6 +13,7 @@ a room (``regularizer_fill.py``). What a step of our own field's training costs 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,6 +40,7 @@ from unghost.prior.checkpoint import TorchDenoiser
 from unghost.prior.networks import build_network
 from unghost.prior.unet import UNetConfig
 from unghost.regularizer.regularizer import DensityRegularizer
+from unghost.regularizer.view_grid import ViewGrid
 from unghost.regularizer.visibility import ViewCounter
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -145,6 +147,15 @@ def visibility_rows(options: Options) -> list[dict[str, Any]]:
         "ours, cells, built each time": lambda: ViewCounter(cameras, aabb=box)(points),
         "ours, cells": lambda: cached(points),
     }
+    for levels in (1, 2, 4):
+        ways[f"ours, cells of 1/{8 << (levels - 1)}, built each time"] = functools.partial(
+            lambda levels: np.asarray(ViewGrid(cameras, box, min_views=1, levels=levels).count(points)), levels
+        )
+    for levels in (1, 2, 3, 4):  # a cell in which cameras disagree counts as seen
+        grid = ViewGrid(cameras, box, min_views=1, levels=levels)
+        ways[f"cells of 1/{8 << (levels - 1)} alone"] = functools.partial(
+            lambda grid: grid.look_up(points)[0] != 0, grid
+        )
     truth, rows = cameras.view_count(points) > 0, []
     for name, way in ways.items():
         seconds, found = median_seconds(way, options.repeats)

@@ -108,6 +108,8 @@ class DensityRegularizer:
             )
         self.grid = ImportanceGrid(self.aabb, resolution=s.grid_resolution, decay=s.grid_decay)
         self._views: ViewCounter | None = None
+        if depth_maps is not None and cameras is None:
+            raise ValueError("DensityRegularizer: depth_maps must come with cameras, got cameras=None")
         if cameras is not None and len(cameras):
             warn_if_turned_away(cameras, self.aabb, caller="DensityRegularizer")
             reach = grow_box(self.aabb, s.visibility_reach)

@@ -17,7 +17,7 @@ from ..core.cameras import Cameras, distort, largest_radius, undistort
 from ..core.cube_views import BORDER_POINTS
 
 MOST_TANGENTIAL = 0.05  # of p1, p2: beyond, a lens may fold where its radial terms do not tell
-COARSEST, LEVELS = 8, 3  # cells along an axis at first, and how often: up to 32
+COARSEST, LEVELS = 8, 3  # cells along an axis at first, and in how many sizes: down to 32 along it
 CHUNK = 4096  # cells looked at together
 GROUP = 16  # cameras asked together: what enough of them see is not held against the others
 SLACK = 1e-5  # of the distances involved: float32 rounds
@@ -96,10 +96,11 @@ class ViewGrid:
         cameras: fixed.
         aabb: ``(2, 3)``.
         min_views: where counting stops.
+        levels: sizes of cells: 1 to 4 give 8, 16, 32 or 64 along a side.
     """
 
-    def __init__(self, cameras: Cameras, aabb: FloatArray, *, min_views: int) -> None:
-        self._cameras = cameras
+    def __init__(self, cameras: Cameras, aabb: FloatArray, *, min_views: int, levels: int = LEVELS) -> None:
+        self._cameras, self._levels = cameras, levels
         self.aabb, self.min_views = np.asarray(aabb, dtype=np.float64), min_views
         sure, possible = image_rectangles(cameras)
         reliable = np.asarray(np.isfinite(sure).all(axis=1))
@@ -111,9 +112,9 @@ class ViewGrid:
         ]
         reach = np.abs(self.aabb).max() + np.abs(cameras.origins).max(initial=0.0)
         self._slack = np.float32(SLACK * reach)
-        self.cells = np.full((COARSEST << (LEVELS - 1),) * 3, OPEN, dtype=np.int16)
+        self.cells = np.full((COARSEST << (levels - 1),) * 3, OPEN, dtype=np.int16)
         open_ = np.stack(np.meshgrid(*[np.arange(COARSEST)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-        for level in range(LEVELS):
+        for level in range(levels):
             open_ = self._settle(open_, level)
             children = np.stack(np.meshgrid(*[np.arange(2)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
             open_ = (2 * open_[:, None] + children).reshape(-1, 3)
@@ -131,7 +132,7 @@ class ViewGrid:
             for _, point in self._disputed(centers[few], side / 2):
                 few[point] = -1
             settled[few[few >= 0]] = True
-            size = 1 << (LEVELS - 1 - level)
+            size = 1 << (self._levels - 1 - level)
             blocks = self.cells.reshape(*(n for _ in range(3) for n in (COARSEST << level, size)))
             x, y, z = part[settled].T
             blocks[x, :, y, :, z, :] = np.minimum(least[settled], self.min_views)[:, None, None, None]
@@ -157,8 +158,8 @@ class ViewGrid:
             camera, box = np.nonzero(perhaps & ~(_within(inner, centers, half, self._slack) & reliable))
             yield group[camera], box
 
-    def count(self, positions: FloatArray) -> NDArray[np.int64]:
-        """``min(view count, min_views)`` of points ``(N, 3)``, ``OPEN`` outside the box; ``(N,)``."""
+    def look_up(self, positions: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """What the cells of points ``(N, 3)`` say, ``OPEN`` outside the box; and which points are inside; ``(N,)``."""
         count = self.cells.shape[0]
         scale = count / (self.aabb[1] - self.aabb[0])
         inside, index = np.ones(len(positions), dtype=bool), np.zeros(len(positions), dtype=np.int32)
@@ -170,6 +171,11 @@ class ViewGrid:
         index[~inside] = 0
         found = self.cells.reshape(-1)[index].astype(np.int64)
         found[~inside] = OPEN
+        return found, inside
+
+    def count(self, positions: FloatArray) -> NDArray[np.int64]:
+        """``min(view count, min_views)`` of points ``(N, 3)``, ``OPEN`` outside the box; ``(N,)``."""
+        found, inside = self.look_up(positions)
         left = np.flatnonzero((found == OPEN) & inside)
         for start in range(0, len(left), CHUNK):
             part = left[start : start + CHUNK]

@@ -502,6 +502,8 @@ def test_what_something_hides_counts_as_unseen(kit, aabb):
         share = regularizer.report["unseen"] / regularizer.report["points"]
         assert level == pytest.approx(0.125 * share)
         shares.append(share)
+    with pytest.raises(ValueError, match="depth_maps must come with cameras"):
+        build(kit, aabb, kit.identity, depth_maps=wall)
     assert shares[0] < 0.01
     assert shares[1] == pytest.approx(0.5 - 0.05 * 3 / 2 / (aabb[1][2] - aabb[0][2]) * 2, abs=0.06)
 

@@ -59,6 +59,19 @@ def test_large_blocks_miss_what_is_small_and_alone():
     assert not surveyed(density, 8).judged.any()
 
 
+def test_a_sheet_thinner_than_a_block_is_seen_by_asking_everywhere_and_stays_otherwise(kit):
+    box = np.array([[0.0, 0.0, 0.0], [32.0, 32.0, 32.0]])
+
+    def sheet(positions):  # about the middles of one layer of cells, between two layers of probes
+        return 5.0 * (np.abs(positions[:, 2] - 16.5) < 0.4)
+
+    options = {"denoiser": kit.numpy_denoiser(kit.all_empty), "field_pitch": 1.0}
+    seen, missed = (clean(sheet, box, probe=probe, **options) for probe in (1, 2))
+    assert (~seen.cells).sum() == 32 * 32
+    assert missed.cells.all()
+    assert missed.details["occupied"] == 0
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -1.0])
 def test_invalid_densities_are_found_in_empty_space(bad):
     box = np.array([[0.0, 0.0, 0.0], [20.0, 20.0, 20.0]])

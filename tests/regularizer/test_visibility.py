@@ -61,6 +61,17 @@ def test_cells_settle_nothing_wrongly(lens, min_views):
     assert ViewCounter(rig, aabb=BOX)(np.zeros((0, 3))).shape == (0,)
 
 
+@pytest.mark.parametrize("levels", [1, 2, 4])
+def test_cells_of_any_size_give_the_same_counts(levels):
+    rig, points = cameras(), np.random.default_rng(8).uniform(BOX[0], BOX[1], (3000, 3))
+    grid = ViewGrid(rig, BOX, min_views=2, levels=levels)
+    assert grid.cells.shape == (4 << levels,) * 3
+    np.testing.assert_array_equal(grid.count(points), np.minimum(rig.view_count(points), 2))
+    found, inside = grid.look_up(points)
+    assert inside.all()
+    assert (found[found != OPEN] == grid.count(points)[found != OPEN]).all()
+
+
 def test_most_of_a_box_is_settled_beforehand():
     grid = ViewGrid(cameras(), BOX, min_views=1)
     assert (grid.cells == OPEN).mean() < 0.5
