@@ -190,11 +190,11 @@ def uniform_cube(value: float, answer: float, dtype: torch.dtype) -> float:
 
 def timestep(step: int, dtype: torch.dtype) -> float:
     def field(p: Any) -> Any:
-        return torch.full((len(p),), 1.5, dtype=dtype)
+        return torch.full((len(p),), 0.625, dtype=dtype)
 
     loss = build(None, timestep=step)(field)["dsds"].item()
     clean(field, BOX, denoiser=Fixed(None), resolution=16, timestep=step, backend="torch")
-    return relative(loss, 1.5 * PITCH)  # opacity .09: shown as -.82, hence pushed out
+    return relative(loss, 0.625 * PITCH)  # opacity .04: shown as -.93, hence pushed out
 
 
 def nothing() -> None:

@@ -61,7 +61,7 @@ class RegularizerSettings:
     strategy: Strategy = "mixed"
     uniform_share: float = 0.25
     timestep: Timestep = None
-    threshold: float | None = -0.7
+    threshold: float | None = -0.9
     fill_threshold: float | None = None
     target: float | None = None
     dsds_weight: float = 0.1

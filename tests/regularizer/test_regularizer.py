@@ -309,7 +309,7 @@ def test_thresholds_come_from_the_manifest_and_can_be_set(kit, aabb):
 
 @pytest.mark.parametrize(
     ("score", "expected"),
-    [(-0.71, 0.1), (-0.69, 0.0), (0.89, 0.0), (0.91, -math.log(0.9) - 0.1)],
+    [(-0.91, 0.1), (-0.89, 0.0), (0.89, 0.0), (0.91, -math.log(0.9) - 0.1)],
 )
 def test_only_what_is_sure_moves(kit, aabb, score, expected):
     regularizer, _ = build(kit, aabb, lambda c: np.full_like(c, score), skip_empty=False)
