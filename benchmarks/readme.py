@@ -224,9 +224,28 @@ def curate(results: dict[str, Any]) -> list[str]:
     ]  # fmt: skip
 
 
+def splats(results: dict[str, Any]) -> list[str]:
+    methods = list(dict.fromkeys(row["method"] for row in results["rows"]))
+    keys = ("floater_recall", "recall_blob", "recall_haze", "recall_needle", "surface_kept")
+    lines = []
+    for method in methods:
+        rows = [row for row in results["rows"] if row["method"] == method]
+        means = [number(sum(row[key] for row in rows) / len(rows)) for key in keys]
+        seconds = sorted(row["seconds"] for row in rows)
+        lines.append([method, *means, number(seconds[len(seconds) // 2], 1)])
+    head = ("method", "floaters removed", "clusters", "haze", "needles", "true splats kept", "seconds")
+    count = results["rows"][0]["splats"]
+    return [
+        f"**3D Gaussian splats**: {len(results['seeds'])} furnished rooms of {count:,} splats, "
+        f"{results['floaters']:.0%} of them floaters put there; no photos; the others with the parameters that people "
+        "copy:", "",
+        *table(head, lines),
+    ]  # fmt: skip
+
+
 SECTIONS = {
-    "demo": demo, "denoise": denoise, "channels": channels, "capture": capture, "statistics": statistics,
-    "curate": curate,
+    "demo": demo, "splats": splats, "denoise": denoise, "channels": channels, "capture": capture,
+    "statistics": statistics, "curate": curate,
 }  # fmt: skip
 
 
