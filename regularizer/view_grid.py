@@ -18,9 +18,10 @@ from ..core.cube_views import BORDER_POINTS
 
 MOST_TANGENTIAL = 0.05  # of p1, p2: beyond, a lens may fold where its radial terms do not tell
 COARSEST, LEVELS = 8, 3  # cells along an axis at first, and in how many sizes: down to 32 along it
-CHUNK = 4096  # cells looked at together
-GROUP = 16  # cameras asked together: what enough of them see is not held against the others
+CHUNK = 16384  # cells looked at together
+GROUP = 128  # cameras asked together: what enough of them see is not held against the others
 SLACK = 1e-5  # of the distances involved: float32 rounds
+PAIRS = 1 << 17  # of a camera and a point, held against the lens itself together
 OPEN = -1
 FloatArray = NDArray[np.float64]
 
@@ -83,9 +84,12 @@ def _within(
     """On the inner side of all four planes ``(4, N, 4)`` by ``slack`` and the extent of a box; ``(N, M)``."""
     places = np.concatenate([centers.T, np.ones((1, len(centers)))]).astype(np.float32)
     extent, sign = np.broadcast_to(half, 3).astype(np.float32), np.sign(slack)
-    within = np.ones((planes.shape[1], len(centers)), dtype=bool)
-    for side in planes:
-        within &= side @ places >= (sign * (np.abs(side[:, :3]) @ extent) + slack)[:, None]
+    bounds = sign * (np.abs(planes[:, :, :3]) @ extent) + slack
+    product = np.empty((planes.shape[1], len(centers)), dtype=np.float32)
+    within, beyond = np.ones(product.shape, dtype=bool), np.empty(product.shape, dtype=bool)
+    for side, bound in zip(planes, bounds):
+        np.matmul(side, places, out=product)
+        within &= np.greater_equal(product, bound[:, None], out=beyond)
     return within
 
 
@@ -105,10 +109,10 @@ class ViewGrid:
         sure, possible = image_rectangles(cameras)
         reliable = np.asarray(np.isfinite(sure).all(axis=1))
         inner, outer = _planes(cameras, sure), _planes(cameras, possible)
+        inner[:, ~reliable] = [0.0, 0.0, 0.0, -1.0]  # nothing is surely within those
         count = -(-len(cameras) // GROUP)  # every so-many-th camera: neighbours see alike
         self._groups = [
-            (g, reliable[g, None], inner[:, g], outer[:, g])
-            for g in (np.arange(first, len(cameras), count) for first in range(count))
+            (g, inner[:, g], outer[:, g]) for g in (np.arange(first, len(cameras), count) for first in range(count))
         ]
         reach = np.abs(self.aabb).max() + np.abs(cameras.origins).max(initial=0.0)
         self._slack = np.float32(SLACK * reach)
@@ -129,9 +133,10 @@ class ViewGrid:
             least = self._surely(centers, side / 2)
             settled = least >= self.min_views
             few = np.flatnonzero(~settled)
-            for _, point in self._disputed(centers[few], side / 2):
-                few[point] = -1
-            settled[few[few >= 0]] = True
+            most = sum(
+                (perhaps.sum(axis=0, dtype=np.int32) for _, perhaps in self._perhaps(centers[few], side / 2)), start=0
+            )
+            settled[few] = least[few] == most
             size = 1 << (self._levels - 1 - level)
             blocks = self.cells.reshape(*(n for _ in range(3) for n in (COARSEST << level, size)))
             x, y, z = part[settled].T
@@ -142,21 +147,19 @@ class ViewGrid:
     def _surely(self, centers: FloatArray, half: FloatArray | float) -> NDArray[np.int64]:
         """How many cameras see every point of each box about ``centers (M, 3)``, up to ``min_views`` at least."""
         total, open_ = np.zeros(len(centers), dtype=np.int64), np.arange(len(centers))
-        for _, reliable, inner, _ in self._groups:
+        for _, inner, _ in self._groups:
             if open_.size == 0:
                 break
-            total[open_] += (_within(inner, centers[open_], half, self._slack) & reliable).sum(axis=0)
+            total[open_] += _within(inner, centers[open_], half, self._slack).sum(axis=0, dtype=np.int32)
             open_ = open_[total[open_] < self.min_views]
         return total
 
-    def _disputed(
+    def _perhaps(
         self, centers: FloatArray, half: FloatArray | float
-    ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-        """Cameras and boxes of which a camera may see some point but does not surely see all, group by group."""
-        for group, reliable, inner, outer in self._groups:
-            perhaps = _within(outer, centers, half, -self._slack)
-            camera, box = np.nonzero(perhaps & ~(_within(inner, centers, half, self._slack) & reliable))
-            yield group[camera], box
+    ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.bool_]]]:
+        """Groups of cameras, and which of a group may see some point of which box, ``(G, M)``."""
+        for group, _, outer in self._groups:
+            yield group, _within(outer, centers, half, -self._slack)
 
     def look_up(self, positions: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """What the cells of points ``(N, 3)`` say, ``OPEN`` outside the box; and which points are inside; ``(N,)``."""
@@ -181,8 +184,12 @@ class ViewGrid:
             part = left[start : start + CHUNK]
             total = self._surely(positions[part], 0.0)
             unsure = np.flatnonzero(total < self.min_views)
-            for camera, point in self._disputed(positions[part[unsure]], 0.0):
-                seen = self._cameras.sees(camera, positions[part[unsure[point]]])
-                total += np.bincount(unsure[point[seen]], minlength=len(part))
+            total[unsure] = 0  # counted anew, by the exact test
+            for group, perhaps in self._perhaps(positions[part[unsure]], 0.0):
+                camera, point = np.nonzero(perhaps)
+                for first in range(0, len(camera), PAIRS):
+                    row = unsure[point[first : first + PAIRS]]
+                    seen = self._cameras.sees(group[camera[first : first + PAIRS]], positions[part[row]])
+                    total += np.bincount(row[seen], minlength=len(part))
             found[part] = np.minimum(total, self.min_views)
         return found

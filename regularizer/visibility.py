@@ -110,7 +110,7 @@ class ViewCounter:
         self._depth = None if depth_maps is None else np.asarray(depth_maps)
         box = None if aabb is None else as_aabb(aabb, caller="ViewCounter")
         self._grid = None if box is None else ViewGrid(cameras, box, min_views=self.min_views)
-        self._single = [cameras.select(index) for index in range(len(cameras))]
+        self._cameras = cameras
         self._settled = np.zeros(len(cameras))
 
     def __call__(self, positions: NDArray[Any]) -> NDArray[np.int64]:
@@ -128,7 +128,7 @@ class ViewCounter:
             if open_.size == 0:
                 break
             depth = None if self._depth is None else self._depth[index : index + 1]
-            seen = self._single[index].view_count(points[open_], depth_maps=depth, tolerance=self.tolerance)
+            seen = self._cameras.select(index).view_count(points[open_], depth_maps=depth, tolerance=self.tolerance)
             self._settled[index] += seen.mean()
             counts[open_] += seen
             open_ = open_[counts[open_] < self.min_views]

@@ -189,4 +189,4 @@ def test_memory_does_not_grow_with_the_cameras():
         ViewCounter(rig, min_views=count, aabb=BOX)(points)  # nobody drops out
         most.append(tracemalloc.get_traced_memory()[1] / 1e6)
         tracemalloc.stop()
-    assert most[1] < most[0] + 25  # megabytes; all the cameras' answers at once would take 40 more
+    assert most[1] < most[0] + 40  # megabytes; all the cameras' answers at once would take 130 more
