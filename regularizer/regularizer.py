@@ -313,5 +313,6 @@ class DensityRegularizer:
 
 def _as_float64(values: Any) -> NDArray[np.float64]:
     """An array or tensor (bfloat16 too, which numpy does not know) as a float64 array."""
-    plain = upcast(values.detach()) if isinstance(values, Tensor) else values
+    plain = values.detach() if isinstance(values, Tensor) else values
+    plain = upcast(plain) if isinstance(plain, Tensor) and plain.is_floating_point() else plain
     return np.asarray(to_numpy(plain), dtype=np.float64)

@@ -515,3 +515,5 @@ def test_weights_feed_the_grid(kit, aabb):
     cell = tuple(np.unravel_index(regularizer.grid.observed.argmax(), regularizer.grid.values.shape))
     assert regularizer.grid.observed.sum() == 1
     assert regularizer.grid.values[cell] == 0.75
+    regularizer.observe(torch.tensor([[-1, -1, -1]]), torch.tensor([1]), kind="weight")  # whole numbers are numbers
+    assert regularizer.grid.values[0, 0, 0] == 1.0
