@@ -126,12 +126,9 @@ class KeepMask:
         if not len(boxes):
             return self
         chosen = [as_aabb(box, caller="KeepMask.restored: boxes") for box in boxes]
-        axes = [self.origin[axis] + (np.arange(length) + 0.5) * self.pitch for axis, length in
-                enumerate(self.cells.shape)]  # fmt: skip
         cells = self.cells.copy()
         for box in chosen:
-            x, y, z = ((axis >= low) & (axis <= high) for axis, low, high in zip(axes, box[0], box[1]))
-            cells |= x[:, None, None] & y[:, None] & z
+            cells |= cells_within(lattice_axes(self.aabb, self.pitch, cells.shape), box)
         before = self.details.get("restored", [])
         return dataclasses.replace(
             self, cells=cells, details={**self.details, "restored": [*before, *(box.tolist() for box in chosen)]}
@@ -196,3 +193,16 @@ def lattice_origin(aabb: NDArray[np.float64], pitch: float, shape: tuple[int, ..
     """Lowest corner ``(3,)`` of ``shape`` cells of side ``pitch`` centred on the box."""
     middle: NDArray[np.float64] = (aabb[0] + aabb[1]) / 2 - np.array(shape) * pitch / 2
     return middle
+
+
+def lattice_axes(aabb: NDArray[np.float64], pitch: float, shape: tuple[int, ...]) -> list[NDArray[np.float64]]:
+    """Coordinates of the cells' centres along each axis, scene units."""
+    origin = lattice_origin(aabb, pitch, shape)
+    return [origin[axis] + (np.arange(length) + 0.5) * pitch for axis, length in enumerate(shape)]
+
+
+def cells_within(axes: list[NDArray[np.float64]], box: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which cells ``(X, Y, Z)`` have their centre in a box ``(2, 3)``."""
+    x, y, z = ((axis >= low) & (axis <= high) for axis, low, high in zip(axes, box[0], box[1]))
+    within: NDArray[np.bool_] = x[:, None, None] & y[:, None] & z
+    return within

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..core.occupancy import EMPTY, OccupancyRule, check_density, warn_if_constant
 from .components import dilate
-from .keep_mask import lattice_origin
+from .keep_mask import cells_within, lattice_axes
 from .queries import Query
 from .windows import grow
 
@@ -92,10 +92,10 @@ def survey_field(
     """
     faint_rule = dataclasses.replace(rule, threshold=rule.threshold * faint)
     asker = _Asker(query, drop_invalid)
-    axes = _centres(aabb, pitch, shape)
+    axes = lattice_axes(aabb, pitch, shape)
     signed = np.full(shape, EMPTY, dtype=np.float32)
     occupied, judged, protected = np.zeros(shape, bool), np.zeros(shape, bool), np.zeros(shape, bool)
-    wanted = _within(axes, aabb)
+    wanted = cells_within(axes, aabb)
     if probe > 1:
         wanted &= _worth_asking(asker, aabb, axes, probe, float(faint_rule.density_threshold(opaque_pitch)))
     step = max(1, rows // (shape[1] * shape[2]))
@@ -107,21 +107,9 @@ def survey_field(
         occupied[part][cells] = rule.occupied(values, opaque_pitch)
         judged[part][cells] = faint_rule.occupied(values, opaque_pitch)
     for box in keep_boxes:
-        protected |= _within(axes, np.asarray(box))
+        protected |= cells_within(axes, np.asarray(box))
     warn_if_constant(asker.lowest, asker.highest, asker.asked, caller="clean")
     return Survey(signed, occupied, judged | occupied, protected, asker.asked, asker.dropped)
-
-
-def _centres(aabb: NDArray[np.float64], pitch: float, shape: tuple[int, ...]) -> Axes:
-    """Coordinates of the cells' centres along each axis."""
-    origin = lattice_origin(aabb, pitch, shape)
-    return [origin[axis] + (np.arange(shape[axis]) + 0.5) * pitch for axis in range(3)]
-
-
-def _within(axes: Axes, box: NDArray[np.float64]) -> Mask:
-    """Which centres lie in a box."""
-    x, y, z = ((axis >= low) & (axis <= high) for axis, low, high in zip(axes, box[0], box[1]))
-    return x[:, None, None] & y[:, None] & z
 
 
 def _worth_asking(asker: _Asker, aabb: NDArray[np.float64], axes: Axes, probe: int, limit: float) -> Mask:

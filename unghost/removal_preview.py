@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from .core.occupancy import OccupancyRule
 from .data_recipes.render import GHOST, png_bytes
-from .regularizer.keep_mask import KeepMask
+from .regularizer.keep_mask import KeepMask, lattice_axes
 from .regularizer.queries import make_query
 
 SIDE = 420  # pixels that the longest side of the box takes at least
@@ -24,7 +24,7 @@ FAR, NEAR = 0.45, 0.92  # grey of kept cells at the far side of the box and at t
 def occupied_cells(mask: KeepMask, density_fn: Callable[[Any], Any], rule: OccupancyRule | None = None) -> Any:
     """Which of the mask's cells the field (numpy or torch) occupies ``(X, Y, Z)`` bool; asked at their centres."""
     chosen, shape = rule or OccupancyRule(), mask.cells.shape
-    axes = [mask.origin[axis] + (np.arange(shape[axis]) + 0.5) * mask.pitch for axis in range(3)]
+    axes = lattice_axes(mask.aabb, mask.pitch, shape)
     query = make_query(density_fn, place=mask.aabb.mean(axis=0), caller="occupied_cells")
     occupied = np.zeros(shape, dtype=bool)
     rows = max(1, SLAB // (shape[1] * shape[2]))
