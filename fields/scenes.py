@@ -47,6 +47,7 @@ class PhotographedScene:
         true_cameras: where the photos were really taken.
         images: ``(N, H, W, 3)`` float32 in [0, 1], with exposure and pixel noise.
         depth_maps: ``(N, H, W)`` depth along the optical axis, inf for sky.
+        look: what the camera does to every colour: how much it mutes and how much it veils, each in [0, 1].
     """
 
     scene: SolidScene
@@ -54,6 +55,7 @@ class PhotographedScene:
     true_cameras: Cameras
     images: NDArray[np.float32]
     depth_maps: NDArray[np.float64]
+    look: tuple[float, float] = (0.0, 0.0)
 
 
 def random_scene(rng: np.random.Generator, objects: Sequence[SampledDistance] = ()) -> SolidScene:
@@ -130,22 +132,43 @@ def photograph(
     )
     noise = rng.uniform(0.0, 0.015)
     muted, flat = rng.uniform(0.0, 0.9), rng.uniform(0.0, 0.5)  # colours that real rooms have, and a lens's veil
-    images = np.zeros((count, height, width, 3), dtype=np.float32)
-    depth_maps = np.zeros((count, height, width))
-    rays = [[ray.reshape(-1, 3) for ray in cameras.rays(index)] for index in range(count)]
-    # all at once: most rays arrive within a few steps, and the long tail of the others is traced together
-    colors, distances = scene.render(*(np.concatenate(part) for part in zip(*rays)))
-    shape = (count, height, width)
-    for index, (color, distance) in enumerate(zip(colors.reshape(*shape, 3), distances.reshape(shape))):
-        color = color + muted * (color.mean(axis=-1, keepdims=True) - color)
-        color = (color + flat * (0.5 - color)) * exposure[index] + rng.normal(0, noise, size=(height, width, 3))
-        images[index] = np.clip(color, 0, 1)
-        depth_maps[index] = distance * -(rays[index][1] @ poses[index, :, 2]).reshape(height, width)
+    colors, depth_maps = _photos(scene, cameras, (muted, flat))
+    images = np.zeros(colors.shape, dtype=np.float32)
+    for index, color in enumerate(colors):
+        images[index] = np.clip(color * exposure[index] + rng.normal(0, noise, size=(height, width, 3)), 0, 1)
     jitter = poses.copy()
     jitter[:, :, 3] += rng.normal(0, log_uniform(rng, 5e-4, 5e-3), size=(count, 3))
     axis = rng.normal(0, np.deg2rad(log_uniform(rng, 0.03, 0.25)), size=(count, 3))
     jitter[:, :, :3] = _small_rotations(axis) @ poses[:, :, :3]
-    return PhotographedScene(scene, Cameras.create(jitter, intrinsics, width, height), cameras, images, depth_maps)
+    told = Cameras.create(jitter, intrinsics, width, height)
+    return PhotographedScene(scene, told, cameras, images, depth_maps, (muted, flat))
+
+
+def photograph_again(rng: np.random.Generator, first: PhotographedScene, *, count: int) -> PhotographedScene:
+    """Another casual sweep with the same lens and the same look, without faults: what renders are scored against.
+
+    Raises:
+        RuntimeError: there is no free path through the scene.
+    """
+    lens = first.true_cameras
+    cameras = Cameras.create(sweep(rng, first.scene, count), lens.intrinsics[0], lens.width, lens.height)
+    colors, depth_maps = _photos(first.scene, cameras, first.look)
+    images = np.clip(colors, 0, 1).astype(np.float32)
+    return PhotographedScene(first.scene, cameras, cameras, images, depth_maps, first.look)
+
+
+def _photos(scene: SolidScene, cameras: Cameras, look: tuple[float, float]) -> tuple[Array, Array]:
+    """Colours ``(N, H, W, 3)`` with a camera's look, and depth along the optical axis ``(N, H, W)``."""
+    muted, flat = look
+    shape = (len(cameras), cameras.height, cameras.width)
+    rays = [[ray.reshape(-1, 3) for ray in cameras.rays(index)] for index in range(len(cameras))]
+    # all at once: most rays arrive within a few steps, and the long tail of the others is traced together
+    colors, distances = scene.render(*(np.concatenate(part) for part in zip(*rays)))
+    colors = colors.reshape(*shape, 3)
+    colors = colors + muted * (colors.mean(axis=-1, keepdims=True) - colors)
+    colors = colors + flat * (0.5 - colors)
+    facing = np.stack([-(ray[1] @ pose[:, 2]) for ray, pose in zip(rays, cameras.camera_to_world)])
+    return colors, (distances.reshape(len(cameras), -1) * facing).reshape(shape)
 
 
 def observers(

@@ -4,7 +4,7 @@ import torch
 
 from unghost.core.cameras import Cameras
 from unghost.fields.radiance import RadianceConfig, RadianceField
-from unghost.fields.rendering import Rendering, Sampling, median_distance, render_rays, render_view
+from unghost.fields.rendering import Rendering, Sampling, depth_spread, median_distance, render_rays, render_view
 
 SAMPLING = Sampling(near=0.1, middle=3.1, far_samples=0, near_samples=300)
 
@@ -145,3 +145,19 @@ def test_render_view_sees_the_slab_at_its_depth_in_any_chunking():
     behind = render_view(field, away, 0, sampling=SAMPLING, background=0.25)
     np.testing.assert_allclose(behind["rgb"], 0.25, atol=1e-6)
     assert np.isinf(behind["depth"]).all()
+
+
+def test_depth_spread_by_hand():
+    edges = torch.tensor([1.0, 3.0, 5.0]).expand(3, -1)
+    unused = torch.zeros(3, 3)
+    weights = torch.tensor([[1.0, 0.0], [0.5, 0.5], [0.0, 0.0]])
+    spread = depth_spread(Rendering(unused, weights, edges, unused, unused))
+    # all at 2; half at 2 and half at 4: log 2 apart, deviation half of that; all light leaves at 5
+    torch.testing.assert_close(spread, torch.tensor([0.0, np.log(2.0) / 2, 0.0], dtype=torch.float32))
+
+
+def test_values_are_averaged_as_colours_are():
+    camera = Cameras.create(np.eye(4)[None, :3], np.array([8.0, 8.0, 2.0, 2.0]), 4, 4)
+    field = slab_field(5.0, low=-2.0)
+    view = render_view(field, camera, 0, sampling=SAMPLING, values=lambda positions: torch.ones(len(positions)))
+    np.testing.assert_allclose(view["values"], view["accumulation"], atol=1e-6)

@@ -3,7 +3,7 @@ import pytest
 
 from unghost.core.cameras import Cameras
 from unghost.fields.furniture import FURNITURE, random_shape, random_texture
-from unghost.fields.scenes import _small_rotations, look_at, photograph, random_scene, sweep
+from unghost.fields.scenes import _small_rotations, look_at, photograph, photograph_again, random_scene, sweep
 from unghost.fields.solids import PATTERNS, Solid, SolidScene
 
 
@@ -161,3 +161,21 @@ def test_small_rotations():
     quarter = _small_rotations(np.array([[0.0, 0.0, np.pi / 2], [0.0, 0.0, 0.0]]))
     np.testing.assert_allclose(quarter[0], [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-12)
     np.testing.assert_array_equal(quarter[1], np.eye(3))
+
+
+def test_a_second_sweep_has_the_same_lens_and_look_and_no_faults():
+    rng = np.random.default_rng(5)
+    first = photograph(rng, random_scene(rng), count=3, width=16, height=12)
+    again = photograph_again(np.random.default_rng(6), first, count=4)
+    assert len(again.cameras) == len(again.images) == 4
+    np.testing.assert_array_equal(again.cameras.intrinsics[0], first.true_cameras.intrinsics[0])
+    assert again.look == first.look
+    assert again.cameras is again.true_cameras
+    repeated = photograph_again(np.random.default_rng(6), first, count=4)
+    np.testing.assert_array_equal(again.images, repeated.images)
+    # depth along the axis, back to the surface
+    origins, directions = (ray.reshape(-1, 3) for ray in again.cameras.rays(1))
+    axial = again.depth_maps[1].reshape(-1)
+    hit = np.isfinite(axial)
+    reach = axial[hit] / -(directions[hit] @ again.cameras.camera_to_world[1, :, 2])
+    assert np.abs(first.scene.signed_distance(origins[hit] + reach[:, None] * directions[hit])).max() < 0.02

@@ -1,0 +1,83 @@
+"""The paper's ablation: where cubes are drawn, how large they are, and score distillation through an activation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from trajectory_job import Job, Outcome, fine_tuned, make_regularizer, visibility
+from trajectory_methods import PAPER_PRIOR, paper, paper_timestep, restoration
+
+from unghost import load_denoiser
+from unghost.core.schedule import alphas_cumprod
+from unghost.fields.rendering import render_rays
+from unghost.regularizer.cubes import draw_cubes
+from unghost.regularizer.rivals import Squash, sds_loss, squash_density
+from unghost.regularizer.settings import RegularizerSettings
+
+WEIGHT_RAYS = 1024  # of each training photo, whose weights fill the grid
+EDGES = {"1-10 %": (0.01, 0.1), "10-20 %": (0.1, 0.2), "1-20 %": (0.01, 0.2)}
+
+
+def through_activation(job: Job, how: Squash) -> list[Outcome]:
+    """The paper's "why not just": SDS, with noise, through a clamp or a sigmoid; beside the visibility loss."""
+    denoiser = load_denoiser(str(PAPER_PRIOR), backend="onnx", threads=job.threads)
+    settings = RegularizerSettings.paper(cubes=job.cubes, seed=job.seed)
+    regularizer = visibility(job)
+    cumulative = alphas_cumprod()
+
+    def term(field: Any, step: int) -> Tensor:
+        rng = np.random.default_rng([job.seed, step, 16])
+        cubes = draw_cubes(regularizer.grid, rng, settings, field_pitch=None, resolution=32, device=torch.device("cpu"))
+        signed = squash_density(field.density_fn(cubes.positions)[..., 0], threshold=settings.rule.threshold, how=how)
+        t = paper_timestep(step)
+        alpha = float(cumulative[t])
+        noise = rng.standard_normal(signed.shape).astype(np.float32)
+        noised = np.sqrt(alpha) * signed.detach().numpy() + np.sqrt(1 - alpha) * noise
+        fractions = cubes.edge_fraction.astype(np.float32)
+        x0_pred = denoiser(noised[:, None].astype(np.float32), np.full(len(noised), t, np.int64), fractions)[:, 0]
+        return settings.dsds_weight * sds_loss(signed, torch.from_numpy(x0_pred), alpha_cumprod=alpha).mean()
+
+    return [fine_tuned(job, regularizer, term)]
+
+
+def by_weights(job: Job) -> list[Outcome]:
+    """Cubes where the training photos' rays end: accumulation weights, observed once, fill the grid."""
+    denoiser = load_denoiser(str(PAPER_PRIOR), backend="onnx", threads=job.threads)
+    regularizer = make_regularizer(job, denoiser=denoiser, settings=RegularizerSettings.paper(timestep=paper_timestep))
+    cameras, rng = job.scene.train.cameras, np.random.default_rng([job.seed, 18])
+    with torch.no_grad():
+        for index in range(len(cameras)):
+            chosen = rng.permutation(cameras.width * cameras.height)[:WEIGHT_RAYS]
+            starts, towards = (torch.from_numpy(part.reshape(-1, 3)[chosen]).float() for part in cameras.rays(index))
+            rendering = render_rays(job.base, starts, towards, job.scene.sampling)
+            regularizer.observe(rendering.positions, rendering.weights, kind="weight")
+    weights, observed = regularizer.grid.values.copy(), regularizer.grid.observed.copy()
+
+    def unchanged(field: Any, step: int) -> Tensor:
+        """The densities of the cubes drawn must not take the weights' place."""
+        regularizer.grid.values[:], regularizer.grid.observed[:] = weights, observed
+        return torch.zeros(())
+
+    return [fine_tuned(job, regularizer, unchanged, observed=False)]
+
+
+ABLATION: dict[str, Callable[[Job], list[Outcome]]] = {
+    "paper, cubes drawn uniformly": lambda job: paper(job, strategy="uniform"),
+    "paper, by densities": lambda job: paper(job, strategy="importance"),
+    "paper, by weights": by_weights,
+    "paper, clamp + SDS": lambda job: through_activation(job, "clamp"),
+    "paper, sigmoid + SDS": lambda job: through_activation(job, "sigmoid"),
+    "paper, edges 10-20 %": lambda job: paper(job, edge_range=EDGES["10-20 %"]),
+    "paper, edges 1-20 %": lambda job: paper(job, edge_range=EDGES["1-20 %"]),
+    "ours": restoration,
+    "ours, cubes drawn uniformly": lambda job: restoration(job, strategy="uniform"),
+    "ours, by densities": lambda job: restoration(job, strategy="importance"),
+    **{
+        f"ours, edges {name}": (lambda job, edges=edges: restoration(job, edge_range=edges))
+        for name, edges in EDGES.items()
+    },
+}

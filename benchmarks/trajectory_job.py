@@ -1,0 +1,137 @@
+"""What the methods of the two-trajectory benchmark share: a job, its outcome, fine-tuning and rendering."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+from trajectory_scenes import TrajectoryScene
+
+from unghost import load_denoiser
+from unghost.core.cameras import Cameras
+from unghost.fields.rendering import render_view
+from unghost.fields.training import TrainingConfig, train_field
+from unghost.regularizer.regularizer import DensityRegularizer
+from unghost.regularizer.settings import RegularizerSettings
+
+REACH = 3.0  # how many times the box the visibility loss goes out to
+Views = dict[str, NDArray[Any]]
+Term = Callable[[Any, int], Tensor]
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Factors of the rivals' losses, each the best of a sweep on the development scenes (``--sweep``)."""
+
+    sparsity: float = 1e-3
+    tv: float = 1e-3
+    regnerf: float = 1e-3
+    distortion: float = 2e-2
+    free_space: float = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """A trained field, and how long it may be improved.
+
+    Attributes:
+        scene: what it is of.
+        base: the field; not to be changed.
+        seed: of rays and cubes.
+        steps: of those that train.
+        seconds: instead of steps; None: steps.
+        cubes: a step.
+        threads: of the denoiser.
+        weights: of the rivals' losses.
+    """
+
+    scene: TrajectoryScene
+    base: Any
+    seed: int
+    steps: int
+    seconds: float | None = None
+    cubes: int = 12
+    threads: int = 2
+    weights: Weights = Weights()
+
+    @property
+    def fitting(self) -> TrainingConfig:
+        """As the field was fitted."""
+        return TrainingConfig(rays=self.scene.rays, sampling=self.scene.sampling)
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """One setting of a method.
+
+    Attributes:
+        field: to be rendered and asked.
+        seconds: that it took.
+        steps: of training; 0 for none.
+        knob: where the method's knob stood; None without one.
+        certainty: ``positions -> (M,)``, larger is surer, averaged along rays; None: how sharp a ray's depth is.
+        background_certainty: of light that gets through.
+        note: for the row.
+    """
+
+    field: Any
+    seconds: float
+    steps: int = 0
+    knob: float | None = None
+    certainty: Callable[[Tensor], Tensor] | None = None
+    background_certainty: float = 0.0
+    note: str = ""
+    details: dict[str, Any] = field(default_factory=dict)
+
+
+def render(outcome: Outcome, scene: TrajectoryScene, cameras: Cameras) -> Views:
+    """``rgb (n, H, W, 3)``, ``depth``, ``accumulation`` and ``certainty (n, H, W)``, larger is surer."""
+    views = [render_view(outcome.field, cameras, index, sampling=scene.sampling, values=outcome.certainty)
+             for index in range(len(cameras))]  # fmt: skip
+    stacked = {key: np.stack([view[key] for view in views]) for key in views[0]}
+    if outcome.certainty is None:
+        stacked["certainty"] = -stacked.pop("spread")
+    else:
+        through = 1.0 - stacked["accumulation"]
+        stacked["certainty"] = stacked.pop("values") + through * outcome.background_certainty
+        del stacked["spread"]
+    return stacked
+
+
+def make_regularizer(
+    job: Job, *, denoiser: Any = None, settings: RegularizerSettings | None = None, **over: Any
+) -> Any:
+    used = denoiser or load_denoiser("default", backend="onnx", threads=job.threads)
+    over = {"cubes": job.cubes, "visibility_reach": REACH, "seed": job.seed, **over}
+    return DensityRegularizer(
+        used, aabb=job.base.aabb, cameras=job.scene.train.cameras, field_pitch=job.base.field_pitch,
+        settings=settings, **over,
+    )  # fmt: skip
+
+
+def fine_tuned(
+    job: Job, regularizer: Any = None, *terms: Term, config: TrainingConfig | None = None, note: str = "",
+    observed: bool = True,
+) -> Outcome:  # fmt: skip
+    """A copy of the field after more training with a regularizer's losses and further terms."""
+    tuned = copy.deepcopy(job.base)
+    parts: list[Term] = list(terms)
+    if regularizer is not None:
+        parts.insert(0, lambda field, step: sum(regularizer(field.density_fn).values()))
+    watched = regularizer.observe if regularizer is not None and observed else None
+    budget: dict[str, Any] = {"steps": job.steps} if job.seconds is None else {"seconds": job.seconds}
+    record = train_field(
+        tuned, job.scene.train.cameras, job.scene.train.photos, seed=job.seed, config=config or job.fitting,
+        fine_tune=True, observer=watched,
+        regularizer=(lambda field, step: sum(part(field, step) for part in parts)) if parts else None, **budget,
+    )  # fmt: skip
+    return Outcome(tuned, record["seconds"], record["steps"], note=note)
+
+
+def visibility(job: Job) -> Any:
+    return make_regularizer(job, dsds_weight=0.0)

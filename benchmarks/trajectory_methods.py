@@ -1,0 +1,137 @@
+"""Methods of the two-trajectory benchmark: what each does to a trained field, under the names of the table's rows.
+
+Those that train go on from the same field with the same rays for the same steps; those that do not get the field as it
+is. ``visibility+...`` are the visibility loss and one rival's, as in the paper's table.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from trajectory_job import Job, Outcome, Term, fine_tuned, make_regularizer, visibility
+from trajectory_rivals import free_space, regnerf, sparsity, total_variation
+
+from unghost import load_denoiser
+from unghost.fields.filtered import FilteredField
+from unghost.fields.rendering import render_view
+from unghost.fields.uncertainty import LOWEST, deformation_uncertainty
+from unghost.regularizer.clean import judge
+from unghost.regularizer.components import label_components
+from unghost.regularizer.keep_mask import KeepMask, lattice_axes
+from unghost.regularizer.settings import RegularizerSettings
+from unghost.regularizer.strength import choose_strength
+
+PAPER_PRIOR = Path(__file__).parent / "weights" / "compact-epsilon.onnx"
+PAPER_TIMESTEPS = (10, 50)
+UNCERTAINTY_THRESHOLDS = (0.9, 0.4, 0.5, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.95, 1.0)
+STRENGTHS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7)
+
+
+def _with(*makers: Callable[[Job], Term]) -> Callable[[Job], list[Outcome]]:
+    return lambda job: [fine_tuned(job, visibility(job), *(make(job) for make in makers))]
+
+
+def _distortion(job: Job) -> list[Outcome]:
+    config = dataclasses.replace(job.fitting, distortion_weight=job.weights.distortion)
+    return [fine_tuned(job, visibility(job), config=config)]
+
+
+def restoration(job: Job, **over: Any) -> list[Outcome]:
+    return [fine_tuned(job, make_regularizer(job, **over))]
+
+
+def paper_timestep(step: int) -> int:
+    """The paper's t in [10, 50], anew each step."""
+    return int(np.random.default_rng([step, 15]).integers(PAPER_TIMESTEPS[0], PAPER_TIMESTEPS[1] + 1))
+
+
+def paper(job: Job, **over: Any) -> list[Outcome]:
+    denoiser = load_denoiser(str(PAPER_PRIOR), backend="onnx", threads=job.threads)
+    settings = RegularizerSettings.paper(timestep=paper_timestep, **over)
+    note = "the paper's loss, cubes, schedule and objective; a network of .9 M parameters, as 7.2 M need a GPU"
+    return [fine_tuned(job, make_regularizer(job, denoiser=denoiser, settings=settings), note=note)]
+
+
+def _bayes_rays(job: Job) -> list[Outcome]:
+    begun = time.perf_counter()
+    told = job.scene.train
+    found = deformation_uncertainty(
+        job.base, told.cameras, told.photos, seed=job.seed, sampling=job.scene.sampling, level=7,
+    )  # fmt: skip
+    seconds = time.perf_counter() - begun
+    return [
+        Outcome(
+            FilteredField(job.base, found.keep(threshold)), seconds, knob=threshold,
+            certainty=lambda positions: -found.log_deviation(positions), background_certainty=-LOWEST,
+        )
+        for threshold in UNCERTAINTY_THRESHOLDS
+    ]  # fmt: skip
+
+
+def _components(job: Job) -> list[Outcome]:
+    """Everything opaque that does not hang together with the largest piece goes; on the field's own grid."""
+    begun = time.perf_counter()
+    box, pitch = job.base.aabb, job.base.field_pitch
+    counts = np.ceil((box[1] - box[0]) / pitch - 1e-4).astype(int)
+    axes = lattice_axes(box, pitch, tuple(counts))
+    places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).astype(np.float32)
+    with torch.no_grad():
+        density = job.base.density_fn(torch.from_numpy(places))[..., 0].numpy()
+    occupied = RegularizerSettings().rule.occupied(density, pitch)
+    labels, found = label_components(occupied)
+    largest = int(np.bincount(labels.ravel())[1:].argmax()) + 1 if found else 0
+    mask = KeepMask(box, pitch, ~occupied | (labels == largest))
+    return [Outcome(FilteredField(job.base, mask.keep), time.perf_counter() - begun)]
+
+
+def cleaned(job: Job, base: Any, *, model: str = "default") -> list[Outcome]:
+    """``clean`` of a field: first at the strength that the training photos bear, then at all others."""
+    begun = time.perf_counter()
+    denoiser = load_denoiser(model, backend="onnx", threads=job.threads)
+    told = job.scene.train
+    judgement = judge(base.density_fn, base.aabb, denoiser=denoiser, cameras=told.cameras, field_pitch=base.field_pitch)
+    judged = time.perf_counter() - begun
+    asked = range(0, len(told.cameras), 4)
+
+    def error(mask: Any) -> float:
+        field = FilteredField(base, mask.keep)
+        seen = [render_view(field, told.cameras, index, sampling=job.scene.sampling)["rgb"] for index in asked]
+        return float(np.mean((np.stack(seen) - told.photos[list(asked)]) ** 2))
+
+    choice = choose_strength(judgement, error, strengths=(0.0, *STRENGTHS))
+    chosen = Outcome(FilteredField(base, choice.mask.keep), time.perf_counter() - begun,
+                     details={"strength": choice.strength})  # fmt: skip
+    others = [
+        Outcome(FilteredField(base, judgement.mask(strength).keep), judged, knob=strength) for strength in STRENGTHS
+    ]
+    return [chosen, *others]
+
+
+def _clean_after_visibility(job: Job) -> list[Outcome]:
+    tuned = fine_tuned(job, visibility(job))
+    return [dataclasses.replace(each, seconds=each.seconds + tuned.seconds, steps=tuned.steps)
+            for each in cleaned(job, tuned.field)[:1]]  # fmt: skip
+
+
+METHODS: dict[str, Callable[[Job], list[Outcome]]] = {
+    "field": lambda job: [fine_tuned(job)],
+    "visibility": lambda job: [fine_tuned(job, visibility(job))],
+    "visibility+sparsity": _with(sparsity),
+    "visibility+tv": _with(total_variation),
+    "visibility+regnerf": _with(regnerf),
+    "visibility+distortion": _distortion,
+    "free-space": lambda job: [fine_tuned(job, None, free_space(job))],
+    "bayes-rays": _bayes_rays,
+    "components": _components,
+    "dsds-paper": paper,
+    "dsds-restoration": restoration,
+    "clean": lambda job: cleaned(job, job.base),
+    "visibility+clean": _clean_after_visibility,
+}
+UNTRAINED = ("bayes-rays", "components", "clean")

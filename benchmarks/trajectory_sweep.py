@@ -1,0 +1,90 @@
+"""How much should each rival's loss weigh? Every factor on development scenes, none of which the benchmark scores.
+
+    python benchmarks/trajectory_sweep.py
+
+The best factor is the one whose PSNR is highest where all factors of a loss are cut to the lowest coverage among them,
+mean over the scenes. Writes docs/results/two_trajectory_sweep.json; the benchmark's defaults (``trajectory_job.py``)
+are read off it by hand.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+from fit_cache import FitCache, say
+from trajectory_job import Job, Weights
+from trajectory_methods import METHODS
+from trajectory_scenes import synthetic_scene
+from trajectory_tables import summary_rows
+from two_trajectory import Options as Benchmark
+from two_trajectory import Stage, fitted, scored
+
+from unghost.core.results import build_results, write_results
+from unghost.evaluation.protocol import json_ready
+
+ROOT = Path(__file__).resolve().parents[1]
+FACTORS = {
+    "sparsity": (1e-4, 1e-3, 1e-2), "tv": (1e-4, 1e-3, 1e-2), "regnerf": (1e-4, 1e-3, 1e-2),
+    "distortion": (4e-3, 2e-2, 1e-1), "free_space": (1e-4, 1e-3, 1e-2),
+}  # fmt: skip
+ROWS = {"free_space": "free-space"}
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to try.
+
+    Attributes:
+        scenes: by kind and number of the seed's.
+        scene_seed: not the benchmark's.
+        losses: whose factors; all if left out.
+        fit_steps, steps: as in the benchmark.
+        threads: of torch.
+        out: where the results go.
+        cache: where fitted fields are kept.
+    """
+
+    scenes: tuple[str, ...] = ("room-1", "objects-3")
+    scene_seed: int = 555
+    losses: tuple[str, ...] = tuple(FACTORS)
+    fit_steps: int = 450
+    steps: int = 150
+    threads: int = 2
+    out: Path = ROOT / "docs" / "results"
+    cache: Path = ROOT / "out" / "two_trajectory"
+
+
+def main() -> None:
+    options = tyro.cli(Options, description=__doc__)
+    torch.set_num_threads(options.threads)
+    cache, cells = FitCache(options.cache), list[dict[str, Any]]()
+    for name in options.scenes:
+        scene = synthetic_scene(options.scene_seed, name)
+        pseudo = scene.pseudo(lambda cameras: np.zeros(0))
+        stage = Stage(scene, pseudo, scene.truth(pseudo), options.fit_steps, options.steps)
+        base, _ = fitted(Benchmark(), cache, "field", scene, scene.train, 0, options.fit_steps)
+        for loss in options.losses:
+            method = METHODS[ROWS.get(loss, f"visibility+{loss}")]
+            for factor in FACTORS[loss]:
+                job = Job(scene, base, 0, options.steps, weights=dataclasses.replace(Weights(), **{loss: factor}))
+                row = scored(stage, method(job)[0], None)
+                cells.append({"table": loss, "scene": name, "seed": 0, "method": f"{factor:g}", **row})
+                say(f"{name} {loss} {factor:g}: psnr {row['psnr']:.2f} coverage {row['coverage']:.3f} "
+                    f"disparity {row['disparity_mae']:.3f}")  # fmt: skip
+    rows = summary_rows(cells)
+    for row in rows:
+        row["method"] = f"{row['table']} {row['method']}"
+        say(f"{row['method']}: {row['psnr_at_coverage']:.3f} dB at {row['at_coverage']:.3f}")
+    command = f"python benchmarks/trajectory_sweep.py --scenes {' '.join(options.scenes)}"
+    results = build_results(rows, command=command, seeds=[0], scene_seed=options.scene_seed, threads=options.threads)
+    write_results(options.out / "two_trajectory_sweep.json", json_ready(results))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,175 @@
+"""Means, tables and figures of the two-trajectory benchmark, from its finished rows.
+
+    python benchmarks/trajectory_tables.py                     prints the tables, draws the figures, writes the page
+
+``psnr_at_coverage`` and its like compare methods on a scene and seed where every one of them is cut to the lowest
+coverage among them; between two measured coverages a score is interpolated linearly (``evaluation/curves.py``).
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from unghost.evaluation.curves import Curve
+from unghost.evaluation.intervals import bootstrap_scenes
+
+ROOT = Path(__file__).resolve().parents[1]
+KEYS = (
+    "psnr", "ssim", "flip", "depth_mse", "disparity_mae", "normal_mean_deg", "normal_median_deg", "normal_pct_30",
+    "coverage", "psnr_visible", "ause", "floater_recall", "surface_kept", "holes_filled", "free_space_error", "seconds",
+)  # fmt: skip
+AT_EQUAL = ("psnr", "ssim", "disparity_mae", "normal_mean_deg")
+LOWER_IS_BETTER = ("disparity_mae", "normal_mean_deg")
+FIXED = (0.3, 0.4, 0.5)
+REFERENCE = "pseudo-gt"
+Cell = dict[str, Any]
+
+
+def summary_rows(cells: Sequence[Cell]) -> list[dict[str, Any]]:
+    """A row a table and method: means over scenes and seeds, intervals over scenes, scores at equal coverage."""
+    equal = _at_equal_coverage(cells)
+    rows = []
+    for table, method in dict.fromkeys((cell["table"], cell["method"]) for cell in cells):
+        mine = [cell for cell in cells if (cell["table"], cell["method"]) == (table, method)]
+        row: dict[str, Any] = {
+            "method": method, "table": table, "convention": mine[0]["convention"],
+            "scenes": sorted({cell["scene"] for cell in mine}), "runs": len(mine), "note": mine[0].get("note", ""),
+        }  # fmt: skip
+        intervals = {}
+        for key in KEYS:
+            row[key], intervals[key] = _mean(mine, [cell.get(key) for cell in mine])
+        for key in AT_EQUAL:
+            name = f"{key}_at_coverage"
+            row[name], intervals[name] = _mean(mine, [equal.get((_run(cell), method), {}).get(key) for cell in mine])
+        row["at_coverage"], _ = _mean(mine, [equal.get((_run(cell), method), {}).get("coverage") for cell in mine])
+        for coverage in FIXED:
+            row[f"psnr_at_{coverage:g}"], _ = _mean(mine, [_at(cell, "psnr", coverage) for cell in mine])
+        rows.append({**row, "intervals": intervals, "level": 0.95})
+    return rows
+
+
+def _run(cell: Cell) -> tuple[Any, ...]:
+    return cell["table"], cell["scene"], cell["seed"]
+
+
+def _mean(cells: Sequence[Cell], values: Sequence[float | None]) -> tuple[float | None, list[float | None]]:
+    """Mean of the scenes' means and its interval; undefined values are left out."""
+    scenes: dict[str, list[float | None]] = {}
+    for cell, value in zip(cells, values):
+        scenes.setdefault(cell["scene"], []).append(value)
+    found = bootstrap_scenes(scenes, np.random.default_rng(0))
+    return found.mean, [found.low, found.high]
+
+
+def _curve(cell: Cell, key: str) -> Curve | None:
+    points = [point for point in cell["curve"] if point.get(key) is not None and point.get("coverage") is not None]
+    if not points:
+        return None
+    rows = [{**point, "convention": cell["convention"]} for point in points]
+    return Curve.create(cell["method"], rows, metric=key, higher_is_better=key not in LOWER_IS_BETTER)
+
+
+def _at(cell: Cell, key: str, coverage: float) -> float | None:
+    curve = _curve(cell, key)
+    return None if curve is None else curve.at(coverage)
+
+
+def _at_equal_coverage(cells: Sequence[Cell]) -> dict[tuple[Any, str], dict[str, float | None]]:
+    """(run, method) -> scores where all methods of the run are cut to the lowest coverage among them.
+
+    Other settings of a knob (``method @ knob``) do not lower the bar, and neither does the reference.
+    """
+    result: dict[tuple[Any, str], dict[str, float | None]] = {}
+    for run in dict.fromkeys(map(_run, cells)):
+        mine = [cell for cell in cells if _run(cell) == run]
+        bar = [cell["coverage"] for cell in mine if cell["coverage"] and "@" not in cell["method"]
+               and cell["method"] != REFERENCE]  # fmt: skip
+        if not bar:
+            continue
+        lowest = min(bar)
+        for cell in mine:
+            result[run, cell["method"]] = {"coverage": lowest, **{key: _at(cell, key, lowest) for key in AT_EQUAL}}
+    return result
+
+
+def format_rows(rows: Sequence[dict[str, Any]], keys: Sequence[str]) -> str:
+    """A markdown table."""
+    lines = ["| method | " + " | ".join(keys) + " |", "| --- |" + " --- |" * len(keys)]
+    for row in rows:
+        cells = ["–" if row.get(key) is None else f"{row[key]:.3f}" for key in keys]
+        lines.append(f"| {row['method']} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def _main_rows(results: dict[str, Any], table: str) -> list[dict[str, Any]]:
+    return [row for row in results["rows"] if row["table"] == table and "@" not in row["method"]]
+
+
+def write_figures(path: Path) -> None:
+    """Curves of all methods, averaged over the runs that reach a coverage, beside the points of the main table."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    results = json.loads(path.read_text(encoding="utf-8"))
+    rows = _main_rows(results, "main")
+    if not rows:
+        return
+    figure = Figure(figsize=(13, 5.4), facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    for axes, key, label in zip(
+        figure.subplots(1, 2), ("psnr", "disparity_mae"), ("PSNR, dB (higher is better)", "disparity error (lower)")
+    ):
+        for number, row in enumerate(rows):
+            style = {"color": f"C{number % 10}", "linestyle": ("-", "--")[number // 10 % 2]}
+            strong = row["method"] in ("bayes-rays", "dsds-restoration", "clean", "field", "visibility")
+            points = mean_curve(results["cells"], row["method"], key)
+            if points:
+                axes.plot(*zip(*points), linewidth=2.2 if strong else 1.0, label=row["method"], **style)
+            if row["coverage"] and row[key]:
+                axes.plot(row["coverage"], row[key], "o", color=style["color"], markersize=7 if strong else 4)
+        axes.set_xlabel("coverage: share of all pixels that are scored")
+        axes.set_ylabel(label)
+        axes.grid(alpha=0.25)
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.axes[0].legend(fontsize=8, frameon=False, ncols=2)
+    scenes, runs = sorted({cell["scene"] for cell in results["cells"]}), max(row["runs"] for row in rows)
+    figure.suptitle(
+        f"Score over coverage, mean of {len(scenes)} scenes ({runs} runs a method at most); dots: uncut", fontsize=12
+    )
+    figure.savefig(path.with_suffix(".png"), dpi=110, metadata={"Software": None})
+
+
+def mean_curve(cells: Sequence[Cell], method: str, key: str) -> list[tuple[float, float]]:
+    """(coverage, mean) at coverages that every run of a method reaches."""
+    mine = [cell for cell in cells if cell["table"] == "main" and cell["method"] == method]
+    found = []
+    for coverage in np.round(np.arange(0.1, 1.0, 0.05), 2):
+        values = [_at(cell, key, float(coverage)) for cell in mine]
+        if values and all(value is not None for value in values):
+            found.append((float(coverage), float(np.mean([value for value in values if value is not None]))))
+    return found
+
+
+def main() -> None:
+    path = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "docs" / "results" / "two_trajectory.json"
+    results = json.loads(path.read_text(encoding="utf-8"))
+    results["rows"] = summary_rows(results["cells"])
+    for table in dict.fromkeys(cell["table"] for cell in results["cells"]):
+        print(f"\n{table}\n")
+        rows = _main_rows(results, table)
+        print(format_rows(rows, ("psnr", "ssim", "flip", "depth_mse", "disparity_mae", "normal_mean_deg", "coverage",
+                                 "floater_recall", "surface_kept", "free_space_error", "seconds")))  # fmt: skip
+        print()
+        print(format_rows(rows, ("at_coverage", *(f"{key}_at_coverage" for key in AT_EQUAL),
+                                 *(f"psnr_at_{coverage:g}" for coverage in FIXED))))  # fmt: skip
+    write_figures(path)
+
+
+if __name__ == "__main__":
+    main()

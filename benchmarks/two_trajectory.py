@@ -1,0 +1,281 @@
+"""The two-trajectory benchmark: who takes ghosts out, at equal coverage, on scenes of which everything is known?
+
+    python benchmarks/two_trajectory.py --capture CAPTURE      the whole: a night on two cores
+    python benchmarks/two_trajectory.py --short                two scenes, one seed, few steps: ten minutes
+    python benchmarks/two_trajectory.py --scenes room-0 --methods field visibility
+
+A field is fitted to one sweep of photos, every method improves it (``trajectory_methods.py``) for the same steps, and
+each is scored on another sweep under the convention ``proper``, at its own coverage and cut to others: a method without
+a knob gives up the pixels whose depth is least sharp, ``bayes-rays`` those it is least sure of. Every finished row is
+saved at once in ``docs/results/two_trajectory.json``; what is there is not done again, so that a run that was broken
+off goes on with the same command. ``--equal-seconds`` trains for as long as ``visibility`` took, ``--ablation`` does
+the paper's ablation. Tables and figures: ``trajectory_tables.py``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+from fit_cache import FitCache, Plan, say
+from numpy.typing import NDArray
+from trajectory_ablation import ABLATION
+from trajectory_job import Job, Outcome, Views, render
+from trajectory_methods import METHODS
+from trajectory_scenes import LabelledSpace, Sweep, TrajectoryScene, captured_scene, synthetic_scene
+from trajectory_tables import summary_rows, write_figures
+
+from unghost.core.results import build_results, write_results
+from unghost.evaluation.conventions import evaluation_masks, get_convention
+from unghost.evaluation.curves import cut_to_coverage
+from unghost.evaluation.protocol import json_ready
+from unghost.evaluation.pseudo import PseudoTruth
+from unghost.evaluation.scoring import score_scene
+from unghost.evaluation.sparsification import sparsify
+from unghost.evaluation.views import Renders, Truth
+from unghost.fields.radiance import RadianceConfig, RadianceField
+from unghost.fields.rendering import render_view
+from unghost.fields.training import TrainingConfig, train_field
+
+ROOT = Path(__file__).resolve().parents[1]
+CONVENTION = "proper"
+COVERAGES = tuple(round(0.05 * step, 2) for step in range(2, 20))
+CURVE_KEYS = ("psnr", "ssim", "disparity_mae", "normal_mean_deg")
+SCENES = ("room-0", "room-1", "room-2", "room-5", "objects-4", "objects-27")
+SHORT_SCENES = ("room-1", "objects-4")
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to compare.
+
+    Attributes:
+        scenes: synthetic ones, by kind and number of the seed's.
+        scene_seed: of the synthetic scenes; they were used for nothing else (the methods' settings are of 555).
+        capture: a real one too.
+        train, eval: its sweeps.
+        downscale: its photo pixels per rendered pixel.
+        methods: of the table; all if left out. ``pseudo-gt`` is the field trained on both sweeps.
+        seeds: of fits, rays and cubes.
+        fit_steps: of the fit.
+        steps: of every method that trains.
+        capture_steps: the same two for the capture.
+        equal_seconds: a second table, every training method for as many seconds as ``visibility`` takes.
+        ablation: the paper's ablation instead of the main table.
+        short: two scenes, one seed, a third of the steps.
+        threads: of torch and onnxruntime.
+        out: where two_trajectory.json and the figures go.
+        cache: where fitted fields are kept.
+    """
+
+    scenes: tuple[str, ...] = SCENES
+    scene_seed: int = 2026
+    capture: Path | None = None
+    train: str = "trajectory_1"
+    eval: str = "trajectory_3"
+    downscale: float = 8
+    methods: tuple[str, ...] = ("pseudo-gt", *METHODS)
+    seeds: tuple[int, ...] = (0, 1, 2)
+    fit_steps: int = 450
+    steps: int = 150
+    capture_steps: tuple[int, int] = (360, 300)
+    equal_seconds: bool = False
+    ablation: bool = False
+    short: bool = False
+    threads: int = 2
+    out: Path = ROOT / "docs" / "results"
+    cache: Path = ROOT / "out" / "two_trajectory"
+
+    def shortened(self) -> Options:
+        """As ``short`` says."""
+        if not self.short:
+            return self
+        return dataclasses.replace(self, scenes=SHORT_SCENES, seeds=(0,), fit_steps=150, steps=50)
+
+    def table(self) -> str:
+        """Which of the tables the rows belong to."""
+        return "ablation" if self.ablation else "equal seconds" if self.equal_seconds else "main"
+
+
+class Ledger:
+    """Finished rows on disk; each is there whole or not at all."""
+
+    def __init__(self, options: Options) -> None:
+        self.options = options
+        self.path = options.out / "two_trajectory.json"
+        stored = json.loads(self.path.read_text(encoding="utf-8")) if self.path.exists() else {}
+        self.cells: list[dict[str, Any]] = stored.get("cells", [])
+
+    def key(self, scene: str, seed: int, method: str, steps: int) -> dict[str, Any]:
+        """What a row is known by."""
+        return {"table": self.options.table(), "scene": scene, "seed": seed, "method": method, "steps": steps}
+
+    def has(self, key: dict[str, Any]) -> bool:
+        """Whether that row is finished."""
+        return any(all(cell.get(name) == value for name, value in key.items()) for cell in self.cells)
+
+    def seconds_of(self, scene: str, seed: int, method: str) -> float:
+        """What a method of the main table took there."""
+        for cell in self.cells:
+            if (cell["table"], cell["scene"], cell["seed"], cell["method"]) == ("main", scene, seed, method):
+                return float(cell["seconds"])
+        raise ValueError(f"two_trajectory: equal seconds are those of {method}: do the main table of {scene} first")
+
+    def add(self, rows: list[dict[str, Any]]) -> None:
+        """Keep rows, and write the file with all means anew."""
+        self.cells += [json_ready(row) for row in rows]
+        command = "python benchmarks/two_trajectory.py --capture snowmiku_plush"
+        if self.options.short:
+            command = "python benchmarks/two_trajectory.py --short"
+        seeds = sorted({cell["seed"] for cell in self.cells})
+        results = build_results(
+            summary_rows(self.cells), command=command, seeds=seeds, convention=CONVENTION,
+            scene_seed=self.options.scene_seed, threads=self.options.threads, cells=self.cells,
+        )  # fmt: skip
+        write_results(self.path, json_ready(results))
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """One scene with the truth about it."""
+
+    scene: TrajectoryScene
+    pseudo: PseudoTruth
+    truth: Truth
+    fit_steps: int
+    steps: int
+
+
+def fitted(options: Options, cache: FitCache, stage_name: str, scene: TrajectoryScene, sweep: Sweep, seed: int,
+           steps: int) -> tuple[RadianceField, float]:  # fmt: skip
+    """A field of a sweep, and the seconds its fit took."""
+    config = RadianceConfig(scene.resolution, max(48, scene.resolution * 4 // 5))
+    key = {"photos": sweep.digest(), "seed": seed, "steps": steps, "rays": scene.rays}
+
+    def fit(field: RadianceField) -> dict[str, Any]:
+        fitting = TrainingConfig(rays=scene.rays, sampling=scene.sampling)
+        return train_field(field, sweep.cameras, sweep.photos, steps=steps, seed=seed, config=fitting)
+
+    field, record = cache.field(f"{stage_name}-{scene.name}-{seed}", key, config, fit)
+    return field, record["seconds"]
+
+
+def stages(options: Options, cache: FitCache) -> Iterator[Stage]:
+    """The scenes, one after the other; a capture's truth is that of a field trained on both sweeps."""
+    for name in options.scenes:
+        scene = synthetic_scene(options.scene_seed, name)
+        pseudo = scene.pseudo(lambda cameras: np.zeros(0))
+        yield Stage(scene, pseudo, scene.truth(pseudo), options.fit_steps, options.steps)
+    if options.capture is not None:
+        scene = captured_scene(options.capture, options.train, options.eval, downscale=options.downscale)
+        fit_steps, steps = options.capture_steps
+        field, _ = fitted(options, cache, "pseudo", scene, scene.train.joined(scene.evaluation), 0, fit_steps)
+
+        def depth_of(cameras: Any) -> NDArray[Any]:
+            return np.stack([render_view(field, cameras, index)["depth"] for index in range(len(cameras))])
+
+        pseudo = scene.pseudo(depth_of)
+        yield Stage(scene, pseudo, scene.truth(pseudo), fit_steps, steps)
+
+
+def scored(stage: Stage, outcome: Outcome, space: LabelledSpace | None) -> dict[str, Any]:
+    """All that a row says of one setting of a method."""
+    views = render(outcome, stage.scene, stage.scene.evaluation.cameras)
+    renders = Renders(np.clip(views["rgb"], 0, 1), views["depth"], np.clip(views["accumulation"], 0, 1))
+    extent = stage.scene.extent
+    means = score_scene(renders, stage.truth, extent, convention=CONVENTION).means()
+    mask = evaluation_masks(get_convention(CONVENTION), renders, stage.truth, extent)
+    curve = [{"coverage": means["coverage"], **{key: means[key] for key in CURVE_KEYS}}]
+    for coverage in COVERAGES:
+        if coverage < means["coverage"]:
+            cut = cut_to_coverage(mask, views["certainty"], coverage=coverage)
+            point = score_scene(renders, stage.truth, extent, convention=CONVENTION, within=cut, keys=CURVE_KEYS)
+            curve.append({"coverage": coverage, **{key: point.means()[key] for key in CURVE_KEYS}})
+    row = {"convention": CONVENTION, **means, "psnr_visible": _psnr_visible(renders, stage.truth), "curve": curve}
+    row["ause"] = _ause(views, stage, mask)
+    if space is not None:
+        row |= space.scores(outcome.field)
+    return {**row, "seconds": outcome.seconds, "trained_steps": outcome.steps, "knob": outcome.knob,
+            "note": outcome.note, **outcome.details}  # fmt: skip
+
+
+def _psnr_visible(renders: Renders, truth: Truth) -> float | None:
+    """Of all pixels that a training photo saw, whatever is rendered there: nothing can be gained by removing."""
+    errors = np.mean((renders.colours.astype(np.float64) - truth.photos) ** 2, axis=-1)
+    assert truth.visible is not None
+    values = [-10 * np.log10(error[seen].mean()) for error, seen in zip(errors, truth.visible) if seen.any()]
+    return float(np.mean(values)) if values else None
+
+
+def _ause(views: Views, stage: Stage, mask: NDArray[np.bool_]) -> float | None:
+    """How well the certainty ranks errors of depth: area under the sparsification error curve, 0 is best."""
+    true = stage.pseudo.depth
+    both = mask & np.isfinite(true)
+    if not both.any():
+        return None
+    error = np.abs(np.where(both, views["depth"], 0.0) - np.where(both, true, 0.0))
+    return sparsify(error, -views["certainty"], both).ause
+
+
+def rows_of(key: dict[str, Any], stage: Stage, outcomes: list[Outcome], space: LabelledSpace | None) -> Any:
+    """A row for the method, and one for every other setting of its knob, named ``method @ knob``."""
+    rows = []
+    for number, outcome in enumerate(outcomes):
+        name = key["method"] if number == 0 else f"{key['method']} @ {outcome.knob:g}"
+        rows.append({**key, "method": name, **scored(stage, outcome, space)})
+    return rows
+
+
+def run_stage(options: Options, stage: Stage, cache: FitCache, ledger: Ledger, plan: Plan) -> None:
+    """All seeds and methods of one scene."""
+    scene = stage.scene
+    table: dict[str, Callable[[Job], list[Outcome]]] = ABLATION if options.ablation else METHODS
+    names = tuple(ABLATION) if options.ablation else options.methods
+    for seed in options.seeds:
+        keys = {name: ledger.key(scene.name, seed, name, stage.steps) for name in names}
+        base: RadianceField | None = None
+        space: LabelledSpace | None = None
+        for name in names:
+            plan.begin(name, f"{scene.name}, seed {seed}, {name}")
+            if ledger.has(keys[name]):
+                continue
+            if base is None:
+                base, _ = fitted(options, cache, "field", scene, scene.train, seed, stage.fit_steps)
+                space = LabelledSpace(scene, base, seed) if scene.photographed is not None else None
+            if name == "pseudo-gt":
+                both = scene.train.joined(scene.evaluation)
+                better, seconds = fitted(options, cache, "pseudo", scene, both, seed, stage.fit_steps)
+                outcomes = [Outcome(better, seconds)]
+            else:
+                budget = ledger.seconds_of(scene.name, seed, "visibility") if options.equal_seconds else None
+                outcomes = table[name](Job(scene, base, seed, stage.steps, budget, threads=options.threads))
+            ledger.add(rows_of(keys[name], stage, outcomes, space))
+            last = ledger.cells[-len(outcomes)]
+            say("    " + " ".join(f"{key} {last[key]:.3f}" for key in ("psnr", "disparity_mae", "coverage", "seconds")
+                                  if last.get(key) is not None))  # fmt: skip
+
+
+def main() -> None:
+    options = tyro.cli(Options, description=__doc__).shortened()
+    torch.set_num_threads(options.threads)
+    cache, ledger = FitCache(options.cache), Ledger(options)
+    names = tuple(ABLATION) if options.ablation else options.methods
+    count = (len(options.scenes) + (options.capture is not None)) * len(options.seeds)
+    plan = Plan(list(names) * count, dict.fromkeys(names, 40.0))
+    begun = time.perf_counter()
+    for stage in stages(options, cache):
+        run_stage(options, stage, cache, ledger, plan)
+    write_figures(ledger.path)
+    say(f"{ledger.path} and its figures, {(time.perf_counter() - begun) / 60:.0f} min")
+
+
+if __name__ == "__main__":
+    main()
