@@ -18,12 +18,14 @@ from pathlib import Path
 
 from unghost.commands_prior import expand_shards
 from unghost.prior.config import TrainConfig
+from unghost.prior.network import SIZES
 from unghost.prior.train import train
 from unghost.prior.unet import UNetConfig
 
 ENDLESS = 10_000_000  # steps, where the time decides
 RUNS = {
     "compact-epsilon": TrainConfig(objective="epsilon"),
+    "small-epsilon": TrainConfig(objective="epsilon", network=SIZES["xs"]),  # what two_trajectory.py uses
     "compact-x0": TrainConfig(objective="x0"),
     "compact-bernoulli": TrainConfig(objective="bernoulli"),
     "unet-epsilon": TrainConfig(objective="epsilon", network=UNetConfig(), batch_size=16, learning_rate=2e-4),

@@ -74,8 +74,8 @@ class Outcome:
         seconds: that it took.
         steps: of training; 0 for none.
         knob: where the method's knob stood; None without one.
-        certainty: ``positions -> (M,)``, larger is surer, averaged along rays; None: how sharp a ray's depth is.
-        background_certainty: of light that gets through.
+        uncertainty: ``positions -> (M,)``, the method's own, averaged along rays; None: how far a ray's depth spreads.
+        background_uncertainty: of light that gets through.
         note: for the row.
     """
 
@@ -83,23 +83,21 @@ class Outcome:
     seconds: float
     steps: int = 0
     knob: float | None = None
-    certainty: Callable[[Tensor], Tensor] | None = None
-    background_certainty: float = 0.0
+    uncertainty: Callable[[Tensor], Tensor] | None = None
+    background_uncertainty: float = 0.0
     note: str = ""
     details: dict[str, Any] = field(default_factory=dict)
 
 
 def render(outcome: Outcome, scene: TrajectoryScene, cameras: Cameras) -> Views:
-    """``rgb (n, H, W, 3)``, ``depth``, ``accumulation`` and ``certainty (n, H, W)``, larger is surer."""
-    views = [render_view(outcome.field, cameras, index, sampling=scene.sampling, values=outcome.certainty)
+    """``rgb (n, H, W, 3)``, ``depth``, ``accumulation``, ``spread`` and ``uncertainty (n, H, W)``."""
+    views = [render_view(outcome.field, cameras, index, sampling=scene.sampling, values=outcome.uncertainty)
              for index in range(len(cameras))]  # fmt: skip
     stacked = {key: np.stack([view[key] for view in views]) for key in views[0]}
-    if outcome.certainty is None:
-        stacked["certainty"] = -stacked.pop("spread")
-    else:
+    stacked["uncertainty"] = stacked["spread"]
+    if outcome.uncertainty is not None:
         through = 1.0 - stacked["accumulation"]
-        stacked["certainty"] = stacked.pop("values") + through * outcome.background_certainty
-        del stacked["spread"]
+        stacked["uncertainty"] = stacked.pop("values") + through * outcome.background_uncertainty
     return stacked
 
 

@@ -27,7 +27,7 @@ from unghost.regularizer.keep_mask import KeepMask, lattice_axes
 from unghost.regularizer.settings import RegularizerSettings
 from unghost.regularizer.strength import choose_strength
 
-PAPER_PRIOR = Path(__file__).parent / "weights" / "compact-epsilon.onnx"
+PAPER_PRIOR = Path(__file__).parent / "weights" / "small-epsilon.onnx"
 PAPER_TIMESTEPS = (10, 50)
 UNCERTAINTY_THRESHOLDS = (0.9, 0.4, 0.5, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.95, 1.0)
 STRENGTHS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7)
@@ -54,7 +54,7 @@ def paper_timestep(step: int) -> int:
 def paper(job: Job, **over: Any) -> list[Outcome]:
     denoiser = load_denoiser(str(PAPER_PRIOR), backend="onnx", threads=job.threads)
     settings = RegularizerSettings.paper(timestep=paper_timestep, **over)
-    note = "the paper's loss, cubes, schedule and objective; a network of .9 M parameters, as 7.2 M need a GPU"
+    note = "the paper's loss, cubes, schedule and objective; a network of .29 M parameters (7.2 M need a GPU to train)"
     return [fine_tuned(job, make_regularizer(job, denoiser=denoiser, settings=settings), note=note)]
 
 
@@ -68,7 +68,7 @@ def _bayes_rays(job: Job) -> list[Outcome]:
     return [
         Outcome(
             FilteredField(job.base, found.keep(threshold)), seconds, knob=threshold,
-            certainty=lambda positions: -found.log_deviation(positions), background_certainty=-LOWEST,
+            uncertainty=found.log_deviation, background_uncertainty=LOWEST,
         )
         for threshold in UNCERTAINTY_THRESHOLDS
     ]  # fmt: skip

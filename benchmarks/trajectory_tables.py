@@ -1,7 +1,5 @@
 """Means, tables and figures of the two-trajectory benchmark, from its finished rows.
 
-    python benchmarks/trajectory_tables.py                     prints the tables, draws the figures, writes the page
-
 ``psnr_at_coverage`` and its like compare methods on a scene and seed where every one of them is cut to the lowest
 coverage among them; between two measured coverages a score is interpolated linearly (``evaluation/curves.py``).
 """
@@ -9,7 +7,6 @@ coverage among them; between two measured coverages a score is interpolated line
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,7 +16,6 @@ import numpy as np
 from unghost.evaluation.curves import Curve
 from unghost.evaluation.intervals import bootstrap_scenes
 
-ROOT = Path(__file__).resolve().parents[1]
 KEYS = (
     "psnr", "ssim", "flip", "depth_mse", "disparity_mae", "normal_mean_deg", "normal_median_deg", "normal_pct_30",
     "coverage", "psnr_visible", "ause", "floater_recall", "surface_kept", "holes_filled", "free_space_error", "seconds",
@@ -49,7 +45,7 @@ def summary_rows(cells: Sequence[Cell]) -> list[dict[str, Any]]:
             row[name], intervals[name] = _mean(mine, [equal.get((_run(cell), method), {}).get(key) for cell in mine])
         row["at_coverage"], _ = _mean(mine, [equal.get((_run(cell), method), {}).get("coverage") for cell in mine])
         for coverage in FIXED:
-            row[f"psnr_at_{coverage:g}"], _ = _mean(mine, [_at(cell, "psnr", coverage) for cell in mine])
+            row[f"psnr_at_{coverage:g}"], _ = _mean(mine, [_best(cells, cell, "psnr", coverage) for cell in mine])
         rows.append({**row, "intervals": intervals, "level": 0.95})
     return rows
 
@@ -75,9 +71,13 @@ def _curve(cell: Cell, key: str) -> Curve | None:
     return Curve.create(cell["method"], rows, metric=key, higher_is_better=key not in LOWER_IS_BETTER)
 
 
-def _at(cell: Cell, key: str, coverage: float) -> float | None:
-    curve = _curve(cell, key)
-    return None if curve is None else curve.at(coverage)
+def _best(cells: Sequence[Cell], cell: Cell, key: str, coverage: float) -> float | None:
+    """A method's score at a coverage on one run, its knob turned to its best."""
+    same = [other for other in cells if _run(other) == _run(cell)
+            and (other is cell or other["method"].startswith(f"{cell['method']} @ "))]  # fmt: skip
+    curves = [curve for curve in (_curve(each, key) for each in same) if curve is not None]
+    found = [value for value in (curve.at(coverage) for curve in curves) if value is not None]
+    return (min if key in LOWER_IS_BETTER else max)(found, default=None)
 
 
 def _at_equal_coverage(cells: Sequence[Cell]) -> dict[tuple[Any, str], dict[str, float | None]]:
@@ -94,7 +94,8 @@ def _at_equal_coverage(cells: Sequence[Cell]) -> dict[tuple[Any, str], dict[str,
             continue
         lowest = min(bar)
         for cell in mine:
-            result[run, cell["method"]] = {"coverage": lowest, **{key: _at(cell, key, lowest) for key in AT_EQUAL}}
+            at_bar = {key: _best(mine, cell, key, lowest) for key in AT_EQUAL}
+            result[run, cell["method"]] = {"coverage": lowest, **at_bar}
     return result
 
 
@@ -150,26 +151,7 @@ def mean_curve(cells: Sequence[Cell], method: str, key: str) -> list[tuple[float
     mine = [cell for cell in cells if cell["table"] == "main" and cell["method"] == method]
     found = []
     for coverage in np.round(np.arange(0.1, 1.0, 0.05), 2):
-        values = [_at(cell, key, float(coverage)) for cell in mine]
+        values = [_best(cells, cell, key, float(coverage)) for cell in mine]
         if values and all(value is not None for value in values):
             found.append((float(coverage), float(np.mean([value for value in values if value is not None]))))
     return found
-
-
-def main() -> None:
-    path = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "docs" / "results" / "two_trajectory.json"
-    results = json.loads(path.read_text(encoding="utf-8"))
-    results["rows"] = summary_rows(results["cells"])
-    for table in dict.fromkeys(cell["table"] for cell in results["cells"]):
-        print(f"\n{table}\n")
-        rows = _main_rows(results, table)
-        print(format_rows(rows, ("psnr", "ssim", "flip", "depth_mse", "disparity_mae", "normal_mean_deg", "coverage",
-                                 "floater_recall", "surface_kept", "free_space_error", "seconds")))  # fmt: skip
-        print()
-        print(format_rows(rows, ("at_coverage", *(f"{key}_at_coverage" for key in AT_EQUAL),
-                                 *(f"psnr_at_{coverage:g}" for coverage in FIXED))))  # fmt: skip
-    write_figures(path)
-
-
-if __name__ == "__main__":
-    main()

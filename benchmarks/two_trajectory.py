@@ -5,11 +5,11 @@
     python benchmarks/two_trajectory.py --scenes room-0 --methods field visibility
 
 A field is fitted to one sweep of photos, every method improves it (``trajectory_methods.py``) for the same steps, and
-each is scored on another sweep under the convention ``proper``, at its own coverage and cut to others: a method without
-a knob gives up the pixels whose depth is least sharp, ``bayes-rays`` those it is least sure of. Every finished row is
-saved at once in ``docs/results/two_trajectory.json``; what is there is not done again, so that a run that was broken
-off goes on with the same command. ``--equal-seconds`` trains for as long as ``visibility`` took, ``--ablation`` does
-the paper's ablation. Tables and figures: ``trajectory_tables.py``.
+each is scored on another sweep under the convention ``proper``, at its own coverage and cut to others: it gives up the
+pixels whose depth is least sharp, and a method with a knob has it turned to its best at every coverage. Every finished
+row is saved at once in ``docs/results/two_trajectory.json``; what is there is not done again, so that a run that was
+broken off goes on with the same command. ``--equal-seconds`` trains for as long as ``visibility`` took, ``--ablation``
+does the paper's ablation. Tables and figures: ``trajectory_tables.py``.
 """
 
 from __future__ import annotations
@@ -196,7 +196,7 @@ def scored(stage: Stage, outcome: Outcome, space: LabelledSpace | None) -> dict[
     curve = [{"coverage": means["coverage"], **{key: means[key] for key in CURVE_KEYS}}]
     for coverage in COVERAGES:
         if coverage < means["coverage"]:
-            cut = cut_to_coverage(mask, views["certainty"], coverage=coverage)
+            cut = cut_to_coverage(mask, -views["spread"], coverage=coverage)
             point = score_scene(renders, stage.truth, extent, convention=CONVENTION, within=cut, keys=CURVE_KEYS)
             curve.append({"coverage": coverage, **{key: point.means()[key] for key in CURVE_KEYS}})
     row = {"convention": CONVENTION, **means, "psnr_visible": _psnr_visible(renders, stage.truth), "curve": curve}
@@ -216,13 +216,13 @@ def _psnr_visible(renders: Renders, truth: Truth) -> float | None:
 
 
 def _ause(views: Views, stage: Stage, mask: NDArray[np.bool_]) -> float | None:
-    """How well the certainty ranks errors of depth: area under the sparsification error curve, 0 is best."""
+    """How well the method's uncertainty ranks errors of depth: area under the sparsification error curve, 0 is best."""
     true = stage.pseudo.depth
     both = mask & np.isfinite(true)
     if not both.any():
         return None
     error = np.abs(np.where(both, views["depth"], 0.0) - np.where(both, true, 0.0))
-    return sparsify(error, -views["certainty"], both).ause
+    return sparsify(error, views["uncertainty"], both).ause
 
 
 def rows_of(key: dict[str, Any], stage: Stage, outcomes: list[Outcome], space: LabelledSpace | None) -> Any:

@@ -48,6 +48,10 @@ def test_scores_at_equal_coverage_by_hand(bench):
     assert rows["field"]["psnr_at_0.4"] == pytest.approx((21.0 + 13.0) / 2)
     assert rows["field"]["ssim_at_coverage"] is None
     json.dumps(list(rows.values()), allow_nan=False)
+    turned = cell("bold @ 0.5", "a", 0.6, [(0.6, 25.0), (0.4, 27.0)], psnr=25.0)
+    rows = {row["method"]: row for row in bench["trajectory_tables"].summary_rows([*cells, turned])}
+    assert rows["bold"]["psnr_at_coverage"] == pytest.approx((26.0 + 13.0) / 2)  # at its best setting
+    assert rows["field"]["psnr_at_coverage"] == pytest.approx((20.5 + 14.0) / 2)
 
 
 @pytest.fixture

@@ -1,0 +1,122 @@
+"""``docs/results/README.md``: who wins the two-trajectory benchmark where, in tables and plain words.
+
+python benchmarks/trajectory_page.py            reads two_trajectory.json, writes the page and the figures
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from trajectory_tables import KEYS, format_rows, summary_rows, write_figures
+
+ROOT = Path(__file__).resolve().parents[1]
+OURS = ("dsds-restoration", "clean", "visibility+clean")
+PLAIN = {
+    "psnr_at_coverage": ("masked PSNR", "dB", 1, 2),
+    "ssim_at_coverage": ("masked SSIM", "", 1, 3),
+    "disparity_mae_at_coverage": ("disparity error", "", -1, 3),
+    "normal_mean_deg_at_coverage": ("angle of normals", "°", -1, 1),
+    "free_space_error": ("opacity left in free space", "", -1, 4),
+    "floater_recall": ("labelled floaters removed", "", 1, 3),
+    "surface_kept": ("labelled surface kept", "", 1, 3),
+    "coverage": ("coverage", "", 1, 3),
+}
+Row = dict[str, Any]
+
+
+def main_rows(results: dict[str, Any], table: str) -> list[Row]:
+    """One row a method of a table, other settings of its knob left out."""
+    return [row for row in results["rows"] if row["table"] == table and "@" not in row["method"]]
+
+
+def who_wins(rows: list[Row]) -> list[str]:
+    """A line a score: the best, ours, and the best of the others."""
+    methods = [row for row in rows if row["method"] not in ("pseudo-gt", "field")]
+    lines = []
+    for key, (name, unit, sign, digits) in PLAIN.items():
+        known = [row for row in methods if row.get(key) is not None]
+        mine = [row for row in known if row["method"] in OURS]
+        if not known or not mine:
+            continue
+
+        def said(row: Row, key: str = key, unit: str = unit, digits: int = digits) -> str:
+            return f"`{row['method']}` {row[key]:.{digits}f}{' ' if unit == 'dB' else ''}{unit}"
+
+        best = max(known, key=lambda row: sign * row[key])
+        us = max(mine, key=lambda row: sign * row[key])
+        others = [row for row in known if row["method"] not in OURS]
+        rival = max(others, key=lambda row: sign * row[key]) if others else None
+        won = best["method"] in OURS
+        text = f"- **{name[0].upper()}{name[1:]}: {'we win' if won else 'we lose'}.** Best {said(best)}"
+        text += f"; the best rival {said(rival)}" if won and rival else ("" if won else f"; ours {said(us)}")
+        field = next((row for row in rows if row["method"] == "field"), None)
+        text += f"; the field alone {said(field)}" if field and field.get(key) is not None else ""
+        lines.append(text + ".")
+    return lines
+
+
+def page(results: dict[str, Any]) -> str:
+    """The whole text."""
+    cells, rows = results["cells"], main_rows(results, "main")
+    scenes = list(dict.fromkeys(cell["scene"] for cell in cells if cell["table"] == "main"))
+    seeds = sorted({cell["seed"] for cell in cells if cell["table"] == "main"})
+    text = [
+        "# Who takes ghosts out?", "",
+        "Written by `python benchmarks/trajectory_page.py` from two_trajectory.json, which "
+        f"`{results['command']}` made (commit {results['commit'][:7]}).", "",
+        f"A field is fitted to one sweep of photos and scored on another: {len(scenes)} scenes ({', '.join(scenes)}), "
+        f"seeds {', '.join(map(str, seeds))}; all that trains does so for equally many steps. Synthetic scenes have "
+        "exact depth, normals and visibility, and every place in them is known to be surface or air. The scores' "
+        "convention is `proper` ([what that is](../evaluation.md)); means are over scenes, in brackets elsewhere the "
+        "95 % interval of a bootstrap over scenes.", "",
+        "**Equal coverage.** Whoever removes more is scored on easier pixels. So every method is cut to the lowest "
+        "coverage among all of them on that scene, giving up the pixels whose depth along the ray is least sharp; "
+        "a method with a knob has it turned to its best there (in its favour, and with an eye on the truth).", "",
+        "## In plain words", "", *who_wins(rows), "",
+        "## At equal coverage", "",
+        format_rows(rows, ("at_coverage", "psnr_at_coverage", "ssim_at_coverage", "disparity_mae_at_coverage",
+                           "normal_mean_deg_at_coverage", "psnr_at_0.3", "psnr_at_0.4", "psnr_at_0.5")), "",
+        "![score over coverage](two_trajectory.png)", "",
+        "## As the paper's table has it, each method at its own coverage", "",
+        format_rows(rows, ("psnr", "ssim", "flip", "depth_mse", "disparity_mae", "normal_mean_deg", "normal_median_deg",
+                           "normal_pct_30", "coverage", "psnr_visible", "seconds")), "",
+        "`psnr_visible` is over all pixels that a training photo saw, whatever is rendered there: nothing is won by "
+        "removing. LPIPS needs weights that were not to be had; FLIP is the perceptual measure without any.", "",
+        "## What is known of every place (synthetic scenes)", "",
+        format_rows(rows, ("floater_recall", "surface_kept", "holes_filled", "free_space_error", "ause")), "",
+        "`floater_recall`: of what was opaque in the air, no longer opaque. `ause`: how badly the method's uncertainty "
+        "(for all but `bayes-rays`, the spread of a ray's depth) ranks errors of depth; 0 is perfect.", "",
+    ]  # fmt: skip
+    knobs = [row for row in results["rows"] if row["table"] == "main" and "@" in row["method"]]
+    if knobs:
+        text += ["## Knobs", "", format_rows(knobs, ("psnr", "disparity_mae", "coverage", "floater_recall",
+                                                     "surface_kept")), ""]  # fmt: skip
+    for table, heading in (("equal seconds", "At equal seconds"), ("ablation", "The paper's ablation")):
+        if other := main_rows(results, table):
+            text += [f"## {heading}", "", format_rows(other, ("psnr", "ssim", "disparity_mae", "normal_mean_deg",
+                     "coverage", "psnr_at_coverage", "floater_recall", "surface_kept", "seconds")), ""]  # fmt: skip
+    return "\n".join(text + notes(rows))
+
+
+def notes(rows: list[Row]) -> list[str]:
+    """What a row has to say for itself."""
+    said = [f"- `{row['method']}`: {row['note']}." for row in rows if row.get("note")]
+    few = [row for row in rows if row["runs"] < max(each["runs"] for each in rows)]
+    said += [f"- `{row['method']}`: {row['runs']} runs only." for row in few]
+    return ["## Notes", "", *said, ""] if said else []
+
+
+def main() -> None:
+    path = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "docs" / "results" / "two_trajectory.json"
+    results = json.loads(path.read_text(encoding="utf-8"))
+    results["rows"] = summary_rows(results["cells"])
+    assert set(KEYS) <= set(results["rows"][0])
+    path.with_name("README.md").write_text(page(results), encoding="utf-8")
+    write_figures(path)
+
+
+if __name__ == "__main__":
+    main()
