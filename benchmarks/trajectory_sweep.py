@@ -2,9 +2,8 @@
 
     python benchmarks/trajectory_sweep.py
 
-The best factor is the one whose PSNR is highest where all factors of a loss are cut to the lowest coverage among them,
-mean over the scenes. Writes docs/results/two_trajectory_sweep.json; the benchmark's defaults (``trajectory_job.py``)
-are read off it by hand.
+PSNR is compared where all factors of a loss are cut to the lowest coverage among them, mean over the scenes. Writes
+docs/results/two_trajectory_sweep.json; the benchmark's defaults (``Weights`` in ``trajectory_job.py``) are read off it.
 """
 
 from __future__ import annotations
@@ -50,7 +49,7 @@ class Options:
         cache: where fitted fields are kept.
     """
 
-    scenes: tuple[str, ...] = ("room-1", "objects-3")
+    scenes: tuple[str, ...] = ("room-1",)
     scene_seed: int = 555
     losses: tuple[str, ...] = tuple(FACTORS)
     fit_steps: int = 450

@@ -86,7 +86,7 @@ class Options:
     seeds: tuple[int, ...] = (0, 1, 2)
     fit_steps: int = 450
     steps: int = 150
-    capture_steps: tuple[int, int] = (360, 300)
+    capture_steps: tuple[int, int] = (360, 100)
     equal_seconds: bool = False
     ablation: bool = False
     short: bool = False
