@@ -25,7 +25,8 @@ th, td { text-align: right; padding: 7px 9px; border-bottom: 1px solid var(--lin
 tbody tr:last-child > * { border-bottom: 0; }
 thead th { color: var(--soft); font-weight: 600; font-size: 14px; vertical-align: bottom; white-space: normal; }
 tbody th { font-weight: 500; }
-th:first-child { text-align: left; position: sticky; left: 0; background: var(--card); } td small { display: block; font-size: 12px; }
+th:first-child { text-align: left; position: sticky; left: 0; background: var(--card); }
+td small { display: block; font-size: 12px; }
 .names td:nth-child(2), .names th:nth-child(2), .verdicts td:nth-child(5) { text-align: left; }
 .verdict.better { color: var(--good); font-weight: 600; } .verdict.worse { color: var(--bad); font-weight: 600; }
 .verdict.no { color: var(--soft); }

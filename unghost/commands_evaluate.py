@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import os
+import shlex
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -78,7 +80,8 @@ def evaluate(
     )  # fmt: skip
     notes = [*scene.notes, *_not_proper(convention, name, methods, scene), *unavailable]
     details = _details(gt, scene, found["rows"], references, name, sort) | {"notes": notes}
-    results = build_results(found.pop("rows"), seeds=[seed], evaluation=details, **found)
+    command = shlex.join(["unghost", *sys.argv[1:]])
+    results = build_results(found.pop("rows"), command=command, seeds=[seed], evaluation=details, **found)
     _write(out, results, methods, scene, pairs)
     _say(results)
     print(f"{out / 'report.html'}, results.json, images.csv")
