@@ -30,6 +30,12 @@ from .views import Truth
 KNOB_STEPS = 10  # coverages at which a method with a knob is scored: its own, and nine evenly below it
 EVERY_CONVENTION = (*CONVENTIONS, *PLAIN_CONVENTIONS)
 FALLBACKS = (DEFAULT_CONVENTION, "visible_only", "whole_image")
+IN_WORDS = {
+    "truth.visible": "masks of what the training photos saw",
+    "renders.depth": "depth beside the renders",
+    "renders.accumulation": "accumulation beside the renders",
+    "extent": "the cameras of both sweeps",
+}
 
 
 def possible_conventions(methods: Sequence[Method], truth: Truth, extent: SceneExtent | None) -> tuple[str, ...]:
@@ -57,11 +63,16 @@ def choose_convention(name: str | None, methods: Sequence[Method], truth: Truth,
         return next(each for each in FALLBACKS if each in possible)
     lacking = lacking_maps(name, methods, truth, extent)
     if lacking:
-        listed = "; ".join(f"{method}: {', '.join(maps)}" for method, maps in lacking.items())
+        listed = "; ".join(f"{method}: {in_words(maps)}" for method, maps in lacking.items())
         raise ValueError(
-            f"convention {name!r} needs maps that are not there ({listed}); these allow {', '.join(possible)}"
+            f"convention {name!r} needs what is not there ({listed}); what is there allows {', '.join(possible)}"
         )
     return name
+
+
+def in_words(maps: Iterable[str]) -> str:
+    """What :func:`lacking_maps` found, for people."""
+    return ", ".join(IN_WORDS[each] for each in maps)
 
 
 def compare_methods(
@@ -109,6 +120,7 @@ def compare_methods(
     unknown = set(references) - set(names)
     if unknown:
         raise ValueError(f"compare_methods: references must be among {names}, got {sorted(unknown)}")
+    draws = int(rng.integers(2**32))  # the same for every row: equal renders have equal intervals
     rule, asked = get_convention(convention), None if keys is None else tuple(keys)
     scores: dict[str, SceneScores] = {}
     for each in methods:
@@ -117,14 +129,14 @@ def compare_methods(
     shared = _on_common_pixels(methods, truth, extent, convention, masks) if len(methods) > 1 else {}
     rows = []
     for each in methods:
-        row = _row(each.name, scores[each.name], rng, resamples)
+        row = _row(each.name, scores[each.name], np.random.default_rng(draws), resamples)
         row |= {key: shared[each.name].means().get(stored) for key, stored in _COMMON.items()} if shared else {}
         if each.confidence is not None:
             row["curve"] = _knob(each, truth, extent, convention, masks[each.name])
         rows.append(row)
     ahead = _equal_coverage(rows)
     result: dict[str, Any] = {"rows": rows, "against_points": ahead}
-    result["differences"] = _differences(scores, shared, references, rng, resamples)
+    result["differences"] = _differences(scores, shared, references, draws, resamples)
     if side_by_side:
         result["conventions"] = {
             each.name: _side_by_side(each, truth, extent, network, scores[each.name] if asked is None else None)
@@ -203,7 +215,7 @@ def _equal_coverage(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def _differences(
     scores: Mapping[str, SceneScores], shared: Mapping[str, SceneScores], references: Sequence[str],
-    rng: np.random.Generator, resamples: int,
+    draws: int, resamples: int,
 ) -> list[dict[str, Any]]:  # fmt: skip
     rows = []
     for reference in references:
@@ -212,7 +224,7 @@ def _differences(
             if shared:
                 pairs["psnr_common"] = shared[name].values("psnr"), shared[reference].values("psnr")
             for key, (first, second) in pairs.items():
-                found = bootstrap_difference(first, second, rng, resamples=resamples)
+                found = bootstrap_difference(first, second, np.random.default_rng(draws), resamples=resamples)
                 if found.count:
                     rows.append(
                         {

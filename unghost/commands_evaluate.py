@@ -102,12 +102,14 @@ def report(results: Positional[Path], out: Path | None = None) -> None:
 
 
 def _named(given: Sequence[str]) -> dict[str, Path]:
-    """Method -> folder."""
+    """Method -> folder, from DIR or NAME=DIR; a name or a folder may have a = in it."""
     found: dict[str, Path] = {}
     for word in given:
-        name, equals, folder = word.partition("=")
-        path = Path(folder) if equals and not Path(word).exists() else Path(word)
-        name = name if path != Path(word) else path.resolve().name
+        cuts = [place for place, letter in enumerate(word) if letter == "=" and place]
+        cut = next((place for place in cuts if Path(word[place + 1 :]).is_dir()), cuts[0] if cuts else None)
+        alone = cut is None or Path(word).is_dir()
+        path = Path(word) if cut is None or alone else Path(word[cut + 1 :])
+        name = path.resolve().name if alone else word[:cut]
         if name in found:
             raise ValueError(f"evaluate: two methods are called {name!r} ({found[name]} and {path}); say NAME=DIR")
         found[name] = path
@@ -220,14 +222,14 @@ def _network(backbone: str, metrics: Sequence[str]) -> tuple[Lpips | None, list[
 
 def _not_proper(asked: str | None, name: str, methods: Sequence[Method], scene: _Scene) -> list[str]:
     """Why a convention that nobody named is not the default one."""
-    from .evaluation.comparison import lacking_maps
+    from .evaluation.comparison import in_words, lacking_maps
     from .evaluation.conventions import DEFAULT_CONVENTION
 
     if asked is not None or name == DEFAULT_CONVENTION:
         return []
     lacking = lacking_maps(DEFAULT_CONVENTION, methods, scene.truth, scene.extent)
     wanted = dict.fromkeys(key for maps in lacking.values() for key in maps)
-    return [f"Scored as {name}: {DEFAULT_CONVENTION} needs {', '.join(wanted)} (see docs/evaluation.md)."]
+    return [f"Scored as {name}: {DEFAULT_CONVENTION} needs {in_words(wanted)}."]
 
 
 def _details(
