@@ -11,6 +11,8 @@ MADE := $(VENV)/.made
 INPUTS := pyproject.toml constraints.txt
 SYSTEM_PACKAGES := libusb-1.0-0 libgl1 libegl1 libgomp1 libx11-6
 
+BROWSERS := chromium chromium-browser google-chrome google-chrome-stable
+
 NERFSTUDIO := .venv-nerfstudio
 NERFSTUDIO_NEEDS := 'viser==0.2.7' 'tyro<0.10' tensorboard 'protobuf<=3.20.3' torchmetrics jaxtyping \
 	opencv-python-headless matplotlib splines rich msgpack safetensors tqdm onnxruntime pyyaml
@@ -65,6 +67,17 @@ $(MADE)/system: | $(MADE)/full
 	else echo "open3d lacks system libraries; run: sudo apt-get install $(SYSTEM_PACKAGES)"; fi
 	@touch $@
 
+# The page of `unghost evaluate` is opened in a real browser. Never fatal: without one those tests are skipped.
+$(MADE)/browser: | $(MADE)/venv
+	@if for name in $(BROWSERS); do command -v $$name && break; done >/dev/null; then :; \
+	elif [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+		echo "installing chromium for the tests of pages"; \
+		{ apt-get -qq update && DEBIAN_FRONTEND=noninteractive timeout 600 apt-get -qq install -y \
+			--no-install-recommends chromium; } >/dev/null 2>&1 \
+			|| echo "could not install it; the tests of pages are skipped until: apt-get install chromium"; \
+	else echo "no chromium: the tests of pages are skipped; sudo apt-get install chromium"; fi
+	@touch $@
+
 setup: $(MADE)/full $(MADE)/system
 
 demo-setup: $(MADE)/demo
@@ -72,7 +85,7 @@ demo-setup: $(MADE)/demo
 demo: demo-setup
 	@$(BIN)/unghost demo
 
-test: setup
+test: setup $(MADE)/browser
 	$(BIN)/python -m pytest
 
 check: setup

@@ -144,8 +144,8 @@ def _undefined(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     for row in rows:
         scored, images = row.get("images_scored"), row.get("images")
         if isinstance(scored, int) and isinstance(images, int) and scored < images:
-            lost = "no view" if not scored else f"{scored} of {images} views"
-            said.append(f"{row['method']}: a pixel counts in {lost} only; the means are over those.")
+            counted = f"a pixel counts in {scored} of {images} views only; the means are over those"
+            said.append(f"{row['method']}: {counted if scored else 'no pixel counts in any view'}.")
     return said
 
 

@@ -239,10 +239,10 @@ def _details(
 
     main = rows[len(references) % len(rows)]
     images, photos, extent = main["per_image"], scene.truth.photos, scene.extent
-    if all(each.get(sort) is None and sort not in each["infinite"] for each in images):
+    unsorted = all(each.get(sort) is None and sort not in each["infinite"] for each in images)
+    if unsorted and any(each["pixels"] for each in images):  # with no pixel left at all, any order is as good
         known = [key for key in images[0] if any(isinstance(each[key], float) for each in images)]
-        if known:  # with no pixel left at all, any order is as good
-            raise ValueError(f"evaluate: no view of {main['method']} has a {sort} to sort by, but {', '.join(known)}")
+        raise ValueError(f"evaluate: no view of {main['method']} has a {sort} to sort by, but {', '.join(known)}")
     return {
         "convention": convention, "views": len(photos), "width": photos.shape[2], "height": photos.shape[1],
         "gt": gt.resolve().name, "sort": sort, "sorted_by": main["method"], "references": list(references),

@@ -100,7 +100,7 @@ class Page:
 def browser(tmp_path_factory):
     program = next(filter(None, map(shutil.which, BROWSERS)), None)
     if program is None:
-        pytest.skip("no Chromium on this machine (make setup, as root, installs it)")
+        pytest.skip("no Chromium on this machine (`make test`, as root, installs it)")
     command_in, command_out = os.pipe()
     answer_in, answer_out = os.pipe()
     profile = tmp_path_factory.mktemp("profile")
