@@ -105,7 +105,7 @@ def _head(
 ) -> str:
     facts = results.get("evaluation", {})
     heading = text(" · ".join(methods)) if len(methods) < 4 else f"{len(methods)} methods"
-    said = []
+    said = [f"<code>{text(results['command'])}</code>"] if results.get("command") and not facts else []
     if facts:
         said.append(f"{facts['views']} views of {facts['width']} × {facts['height']} pixels")
         said.append(f"against <code>{text(facts['gt'])}</code>")
@@ -125,7 +125,11 @@ def _group(convention: Any, rows: Sequence[Mapping[str, Any]], colours: Mapping[
     if not alone and name in SOURCES:
         parts.append(f'<p class="soft">{text(SOURCES[name])}.</p>')
     paint = (lambda method: swatch(colours[method])) if len(colours) > 1 else None
-    parts.append(score_table(rows, OWN_KEYS, paint))
+    means = [row for row in rows if row.get("seed") is None]
+    parts.append(score_table(means or rows, OWN_KEYS, paint))
+    if means and len(means) < len(rows):
+        every = score_table(rows, OWN_KEYS, paint)
+        parts.append(f"<details><summary>{len(rows)} rows, seed by seed</summary>{every}</details>")
     if any(row.get("intervals") for row in rows):
         level = next(row.get("level", 0.95) for row in rows if row.get("intervals"))
         said = f"Means over views; below each the {100 * level:.0f} % interval of a bootstrap over views."
@@ -172,10 +176,10 @@ def _coverage_charts(rows: Sequence[Mapping[str, Any]], colours: Mapping[str, in
         for row in (each for each in rows if each.get("scene") == scene):
             points = sorted((point["coverage"], point["psnr"]) for point in row.get("curve") or [row]
                             if _finite(point.get("coverage")) and _finite(point.get("psnr")))  # fmt: skip
-            label = str(row["method"]) + (f", seed {row['seed']}" if row.get("seed") is not None else "")
-            notes = tuple(f"{y:.2f} dB at coverage {x:.3f}" for x, y in points)
+            seed = f", seed {row['seed']}" if row.get("seed") is not None else ""
+            notes = tuple(f"{y:.2f} dB at coverage {x:.3f}{seed}" for x, y in points)
             x, y = (tuple(values) for values in zip(*points)) if points else ((), ())
-            series.append(Series(label, x, y, colours[str(row["method"])], notes))
+            series.append(Series(str(row["method"]), x, y, colours[str(row["method"])], notes))
         chart = line_chart(series, x_label="coverage", y_label="PSNR, dB")
         if chart:
             charts.append(("PSNR over coverage, dB" + (f": {text(scene)}" if scene is not None else ""), chart))

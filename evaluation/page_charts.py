@@ -68,7 +68,8 @@ def line_chart(series: Sequence[Series], *, x_label: str, y_label: str, dots: bo
     parts.append(f'<text x="{(LEFT + WIDTH - RIGHT) / 2}" y="{HEIGHT - 5}" text-anchor="middle">{text(x_label)}</text>')
     for each in drawn:
         parts.append(_line(each, [place(x, y) for x, y in zip(each.x, each.y)], dots))
-    key = "".join(f"<span>{swatch(each.colour)}{text(each.label)}</span>" for each in drawn)
+    labels = dict.fromkeys((each.colour, each.label) for each in drawn)  # several seeds of a method share one
+    key = "".join(f"<span>{swatch(colour)}{text(label)}</span>" for colour, label in labels)
     return "".join(parts) + f'</svg><p class="key">{key}</p>'
 
 

@@ -54,7 +54,8 @@ def evaluate(
         min_views: masks.npz: training views that must see a pixel's point.
         sort: the worst views by this metric come first.
         pairs: how many views are shown as pictures.
-        side_by_side: score under every other convention, too, and tabulate how far they differ.
+        side_by_side: score under every other convention, too, and tabulate how far they differ; it takes most of the
+            time.
         resamples: of the bootstrap.
         seed: of the bootstrap.
     """
@@ -74,6 +75,7 @@ def evaluate(
     references = [each.name for each in methods[: len(against)]]
     if not references and len(methods) > 1:
         references = [methods[0].name]
+    print(f"{len(methods)} method{'s' * (len(methods) > 1)}, {len(scene.truth)} views, convention {name}", flush=True)
     found = compare_methods(
         methods, scene.truth, scene.extent, np.random.default_rng(seed), convention=name, references=references,
         network=network, keys=metrics or None, resamples=resamples, side_by_side=side_by_side,
@@ -287,7 +289,6 @@ def _say(results: Mapping[str, Any]) -> None:
     from .evaluation.report import format_table
 
     rows = results["rows"]
-    print(f"{results['evaluation']['views']} views, convention {results['evaluation']['convention']}")
     shown = [{**row, **{key: float("inf") for key in row["infinite"]}} for row in rows]
     print(format_table(shown, present(rows, [*OWN_KEYS, *EQUAL_KEYS])))
     for note in results["evaluation"]["notes"]:
