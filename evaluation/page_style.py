@@ -67,7 +67,8 @@ figure { margin: 0; } img { display: block; width: 100%; height: auto; } .coarse
 figcaption { font-size: 13px; padding-top: 3px; overflow-wrap: anywhere; }
 details > summary { cursor: pointer; margin: 12px 0; color: var(--accent); }
 @media (max-width: 640px) { main { padding: 24px 14px 48px; } h1 { font-size: 27px; }
-  .chart text { font-size: 18px; } th:first-child { max-width: 38vw; white-space: normal; overflow-wrap: anywhere; }
+  .chart text { font-size: 18px; } thead th { font-size: 13px; }
+  th:first-child { min-width: 33vw; max-width: 38vw; white-space: normal; overflow-wrap: anywhere; }
   .thumbs figure:first-child { grid-column: 1 / -1; } }
 @media print { .scroll { overflow: visible; } .choose, .wipe input { display: none; } }
 """

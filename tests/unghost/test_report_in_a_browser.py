@@ -91,6 +91,12 @@ def test_it_fits_the_screen(browser, report, width, dark, tmp_path):
         "Math.min(...[...document.querySelectorAll('svg.chart text')].map(t => t.getBoundingClientRect().height))"
     )
     assert small > 9
+    first = browser.look(
+        "[...document.querySelectorAll('tbody th')].filter(c => c.offsetWidth)"
+        ".map(c => [c.offsetWidth, c.offsetHeight])"
+    )
+    assert max(each[0] for each in first) < 0.5 * width  # a long name leaves room for its numbers
+    assert max(each[1] for each in first) < 170  # and is no column of single letters
 
 
 def test_without_scripts_all_of_it_can_be_read(browser, report):
