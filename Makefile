@@ -11,12 +11,18 @@ MADE := $(VENV)/.made
 INPUTS := pyproject.toml constraints.txt
 SYSTEM_PACKAGES := libusb-1.0-0 libgl1 libegl1 libgomp1 libx11-6
 
+BROWSERS := chromium chromium-browser google-chrome google-chrome-stable
+
 NERFSTUDIO := .venv-nerfstudio
 NERFSTUDIO_NEEDS := 'viser==0.2.7' 'tyro<0.10' tensorboard 'protobuf<=3.20.3' torchmetrics jaxtyping \
 	opencv-python-headless matplotlib splines rich msgpack safetensors tqdm onnxruntime pyyaml
 
+NERFBASELINES := .venv-nerfbaselines
+NERFBASELINES_NEEDS := 'numpy<2' opencv-python-headless click tqdm Pillow matplotlib plyfile tensorboard scipy \
+	typing-extensions onnxruntime tyro
+
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check clean clean-all demo-setup nerfstudio
+.PHONY: help setup demo test check clean clean-all demo-setup nerfstudio nerfbaselines
 
 help:
 	@echo "make demo       clean a synthetic room with labelled ghosts; writes out/demo/index.html (no torch)"
@@ -24,6 +30,7 @@ help:
 	@echo "make setup      create .venv with every extra, pinned by constraints.txt"
 	@echo "make check      ruff, formatting, mypy"
 	@echo "make nerfstudio nerfacto with the regularizer on, for some steps, in .venv-nerfstudio"
+	@echo "make nerfbaselines  its command line scores with this project's protocols, in .venv-nerfbaselines"
 	@echo "make clean      remove caches and builds"
 	@echo "make clean-all  the same, and .venv"
 	@echo "PYTHON=python3.12 make …  to choose the interpreter (3.10 or later)"
@@ -60,6 +67,17 @@ $(MADE)/system: | $(MADE)/full
 	else echo "open3d lacks system libraries; run: sudo apt-get install $(SYSTEM_PACKAGES)"; fi
 	@touch $@
 
+# The page of `unghost evaluate` is opened in a real browser. Never fatal: without one those tests are skipped.
+$(MADE)/browser: | $(MADE)/venv
+	@if for name in $(BROWSERS); do command -v $$name && break; done >/dev/null; then :; \
+	elif [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+		echo "installing chromium for the tests of pages"; \
+		{ apt-get -qq update && DEBIAN_FRONTEND=noninteractive timeout 600 apt-get -qq install -y \
+			--no-install-recommends chromium; } >/dev/null 2>&1 \
+			|| echo "could not install it; the tests of pages are skipped until: apt-get install chromium"; \
+	else echo "no chromium: the tests of pages are skipped; sudo apt-get install chromium"; fi
+	@touch $@
+
 setup: $(MADE)/full $(MADE)/system
 
 demo-setup: $(MADE)/demo
@@ -67,7 +85,7 @@ demo-setup: $(MADE)/demo
 demo: demo-setup
 	@$(BIN)/unghost demo
 
-test: setup
+test: setup $(MADE)/browser
 	$(BIN)/python -m pytest
 
 check: setup
@@ -88,9 +106,22 @@ $(NERFSTUDIO)/.made:
 nerfstudio: $(NERFSTUDIO)/.made
 	$(NERFSTUDIO)/bin/python -W ignore benchmarks/nerfstudio_client.py $(ARGUMENTS)
 
+# nerfbaselines 1.2.12 wants numpy < 2, an OpenCV with a screen, and torch (only to see that it is there).
+$(NERFBASELINES)/.made:
+	@echo "setting up $(NERFBASELINES) with nerfbaselines 1.2.12 …"
+	@$(PYTHON) -m venv $(NERFBASELINES)
+	@$(NERFBASELINES)/bin/pip install --quiet torch==2.13.0 'numpy<2' setuptools wheel
+	@$(NERFBASELINES)/bin/pip install --quiet --no-deps nerfbaselines==1.2.12
+	@$(NERFBASELINES)/bin/pip install --quiet $(NERFBASELINES_NEEDS)
+	@$(NERFBASELINES)/bin/pip install --quiet --no-deps --no-build-isolation -e .
+	@touch $@
+
+nerfbaselines: $(NERFBASELINES)/.made
+	$(NERFBASELINES)/bin/python -W ignore benchmarks/nerfbaselines_client.py $(ARGUMENTS)
+
 clean:
 	rm -rf build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
 	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +
 
 clean-all: clean
-	rm -rf $(VENV) $(NERFSTUDIO)
+	rm -rf $(VENV) $(NERFSTUDIO) $(NERFBASELINES)

@@ -12,7 +12,6 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core.cameras import Cameras
 from .checks import Mask, choose
@@ -116,11 +115,28 @@ _ALL = (
 )  # fmt: skip
 CONVENTIONS: Mapping[str, Convention] = MappingProxyType({each.name: each for each in _ALL})
 DEFAULT_CONVENTION = "proper"
+_PLAIN = (
+    Convention(
+        "visible_only",
+        "this project, for renders without depth: the pixels that the training photos saw, whatever was rendered "
+        "there, so that coverage is the same for everybody",
+        (*IMAGE_KEYS, "flip", "coverage"),
+        visible=True, depth_limit=None, ssim="inside_mask",
+    ),
+    Convention(
+        "whole_image",
+        "everybody's: nothing is masked, neither what no training photo saw nor what was removed",
+        (*IMAGE_KEYS, "flip", "coverage"),
+        visible=False, depth_limit=None,
+    ),
+)  # fmt: skip
+PLAIN_CONVENTIONS: Mapping[str, Convention] = MappingProxyType({each.name: each for each in _PLAIN})
+"""Not the protocol's: what can be said of renders that come without depth, or of photos that come without masks."""
 
 
 def get_convention(name: str) -> Convention:
-    """The convention of that name; an unknown name lists the choices."""
-    return choose("get_convention", "name", name, CONVENTIONS)
+    """The convention of that name, published or plain; an unknown name lists the choices."""
+    return choose("get_convention", "name", name, {**CONVENTIONS, **PLAIN_CONVENTIONS})
 
 
 @dataclass(frozen=True)
@@ -153,30 +169,33 @@ class SceneExtent:
         return {"scene": self.limit, "unit": 2.0 * self.unit, None: None}[convention.depth_limit]
 
 
-def missing_maps(convention: Convention, renders: Renders, truth: Truth) -> tuple[str, ...]:
-    """Which maps the convention's mask, coverage or Dice need and the caller did not give."""
+def missing_maps(
+    convention: Convention, renders: Renders, truth: Truth, *, extent_known: bool = True
+) -> tuple[str, ...]:
+    """Which maps the convention's mask, coverage or Dice need and the caller did not give; ``extent`` if that."""
     needs_visible = convention.visible or convention.coverage_of == "visible" or "dice" in convention.keys
-    wanted: dict[str, tuple[bool, NDArray[Any] | None]] = {
+    wanted: dict[str, tuple[bool, Any]] = {
         "truth.visible": (needs_visible, truth.visible),
         "renders.depth": (convention.depth_limit is not None, renders.depth),
         "renders.accumulation": (convention.accumulation is not None, renders.accumulation),
+        "extent": (convention.depth_limit is not None, extent_known or None),
     }
     return tuple(name for name, (needed, values) in wanted.items() if needed and values is None)
 
 
-def evaluation_masks(convention: Convention, renders: Renders, truth: Truth, extent: SceneExtent) -> Mask:
+def evaluation_masks(convention: Convention, renders: Renders, truth: Truth, extent: SceneExtent | None) -> Mask:
     """``(n, H, W)`` bool: the pixels that count under a convention.
 
     Raises:
-        ValueError: a map that the convention needs is missing (named).
+        ValueError: a map that the convention needs, or the scene's extent, is missing (named).
     """
-    lacking = missing_maps(convention, renders, truth)
+    lacking = missing_maps(convention, renders, truth, extent_known=extent is not None)
     if lacking:
         raise ValueError(f"evaluation_masks: convention {convention.name!r} needs {', '.join(lacking)}")
     masks = np.ones(truth.photos.shape[:3], dtype=np.bool_)
     if convention.visible and truth.visible is not None:
         masks &= truth.visible
-    limit = extent.depth_limit(convention)
+    limit = None if extent is None else extent.depth_limit(convention)
     if limit is not None and renders.depth is not None:
         masks &= renders.depth < limit
     if convention.accumulation is not None and renders.accumulation is not None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .conventions import CONVENTIONS, one_convention
+from .conventions import get_convention, one_convention
 from .protocol import json_ready
 
 TABLE_KEYS = (
@@ -77,7 +77,7 @@ def convention_rows(scores: Mapping[str, Mapping[str, Any]]) -> list[dict[str, A
     for name, each in scores.items():
         if each.get("convention", name) != name:
             raise ValueError(f"convention_rows: the scores given as {name!r} are of {each['convention']!r}")
-    keys = dict.fromkeys(key for name in scores if name in CONVENTIONS for key in CONVENTIONS[name].keys)
+    keys = dict.fromkeys(key for name in scores for key in get_convention(name).keys)
     rows = []
     for key in keys:
         values = {name: each.get(key) for name, each in scores.items()}

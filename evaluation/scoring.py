@@ -66,7 +66,7 @@ class SceneScores:
 def score_scene(
     renders: Renders,
     truth: Truth,
-    extent: SceneExtent,
+    extent: SceneExtent | None,
     *,
     convention: str,
     within: Mask | None = None,
@@ -79,8 +79,9 @@ def score_scene(
     Args:
         renders: of every evaluation view.
         truth: of the same views.
-        extent: :meth:`SceneExtent.of` both trajectories.
-        convention: a key of ``CONVENTIONS``.
+        extent: :meth:`SceneExtent.of` both trajectories; None where no cameras are known, for conventions that have no
+            depth limit.
+        convention: a name that :func:`get_convention` knows.
         within: ``(n, H, W)`` bool, only these of the convention's pixels count: those of
             :func:`unghost.evaluation.curves.cut_to_coverage`, or that all compared methods have.
         network: of :func:`unghost.evaluation.perceptual.load_lpips`; without it LPIPS is None and noted.
@@ -123,7 +124,7 @@ def score_scene(
 def score_under_all(
     renders: Renders,
     truth: Truth,
-    extent: SceneExtent,
+    extent: SceneExtent | None,
     *,
     conventions: Sequence[str] = tuple(CONVENTIONS),
     network: Lpips | None = None,
@@ -132,7 +133,7 @@ def score_under_all(
     check_match("score_under_all", renders, truth)
     result = {}
     for name in conventions:
-        lacking = missing_maps(get_convention(name), renders, truth)
+        lacking = missing_maps(get_convention(name), renders, truth, extent_known=extent is not None)
         if lacking:
             result[name] = SceneScores(name, (), {"masks": f"it needs {', '.join(lacking)}"})
         else:
@@ -228,12 +229,12 @@ def _through_bits(image: NDArray[Any], bits: str | None) -> NDArray[Any]:
 
 def _geometry_scores(
     rule: Convention, renders: Renders, truth: Truth, mask: Mask, index: int, wanted: Sequence[str],
-    extent: SceneExtent,
+    extent: SceneExtent | None,
 ) -> dict[str, float]:  # fmt: skip
     result: dict[str, float] = {}
     depth, pseudo = (None if each.depth is None else each.depth[index].astype(np.float64) for each in (renders, truth))
     surface = pseudo
-    if pseudo is not None and rule.clipped_depth:
+    if pseudo is not None and rule.clipped_depth and extent is not None:
         surface = np.where(pseudo < extent.limit, pseudo, np.inf)  # no normal where it is cut
         pseudo = np.minimum(pseudo, extent.limit)
     if depth is not None and pseudo is not None:

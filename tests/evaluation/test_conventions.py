@@ -6,7 +6,7 @@ import pytest
 from unghost.core.cameras import Cameras
 from unghost.evaluation import conventions
 from unghost.evaluation.checks import choose
-from unghost.evaluation.conventions import CONVENTIONS, SceneExtent, get_convention
+from unghost.evaluation.conventions import CONVENTIONS, PLAIN_CONVENTIONS, SceneExtent, get_convention
 from unghost.evaluation.metrics import PSNR_CONVENTIONS, SSIM_CONVENTIONS
 from unghost.evaluation.perceptual import LPIPS_CONVENTIONS
 from unghost.evaluation.views import Renders, Truth
@@ -27,7 +27,7 @@ def test_every_published_convention_is_there_and_frozen():
         CONVENTIONS["proper"].visible = False
     with pytest.raises(TypeError):
         CONVENTIONS["mine"] = CONVENTIONS["proper"]
-    with pytest.raises(ValueError, match=r"name must be one of proper, .*, nerfbaselines, got 'nerfbuster'"):
+    with pytest.raises(ValueError, match=r"name must be one of proper, .*, whole_image, got 'nerfbuster'"):
         get_convention("nerfbuster")
 
 
@@ -46,8 +46,22 @@ def test_every_convention_names_rules_that_exist():
 
 
 def test_no_two_conventions_are_the_same():
-    stripped = {dataclasses.replace(each, name="", source="") for each in CONVENTIONS.values()}
-    assert len(stripped) == len(CONVENTIONS)
+    everything = {**CONVENTIONS, **PLAIN_CONVENTIONS}
+    assert len(everything) == len(CONVENTIONS) + len(PLAIN_CONVENTIONS)
+    stripped = {dataclasses.replace(each, name="", source="") for each in everything.values()}
+    assert len(stripped) == len(everything)
+
+
+def test_the_plain_ones_need_no_cameras_and_no_depth():
+    colours = np.zeros((1, 1, 4, 3))
+    renders, seen = Renders(colours), np.array([[[True, False, True, False]]])
+    whole, visible = PLAIN_CONVENTIONS["whole_image"], PLAIN_CONVENTIONS["visible_only"]
+    assert conventions.evaluation_masks(whole, renders, Truth(colours), None).all()
+    found = conventions.evaluation_masks(visible, renders, Truth(colours, seen), None)
+    np.testing.assert_array_equal(found, seen)
+    assert conventions.missing_maps(visible, renders, Truth(colours)) == ("truth.visible",)
+    with pytest.raises(ValueError, match=r"'proper' needs truth\.visible, renders\.depth, extent"):
+        conventions.evaluation_masks(CONVENTIONS["proper"], renders, Truth(colours), None)
 
 
 def test_the_two_lengths_of_a_scene_by_hand():

@@ -13,6 +13,7 @@ from unghost.core.manifest import FORMAT, METADATA_KEY, Manifest
 from unghost.core.packing import unpack_labels
 from unghost.core.shards import ARRAYS, read_shard
 from unghost.core.shards import FORMAT as SHARD_FORMAT
+from unghost.evaluation.conventions import CONVENTIONS, PLAIN_CONVENTIONS
 
 ROOT = Path(__file__).resolve().parents[2]
 FORMATS = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
@@ -25,7 +26,8 @@ def test_every_key_of_the_formats_is_documented():
 
 
 @pytest.mark.parametrize(
-    "name", ["README.md", "CHANGELOG.md", "docs/conventions.md", "docs/formats.md", "docs/prior.md"]
+    "name",
+    ["README.md", "CHANGELOG.md", "docs/conventions.md", "docs/formats.md", "docs/prior.md", "docs/evaluation.md"],
 )
 def test_links_between_documents_lead_somewhere(name):
     path = ROOT / name
@@ -52,3 +54,8 @@ def test_the_sample_of_the_harvest_is_whole_small_and_ours():
         assert getattr(shard, name) is not None, name
     assert set(np.unique(unpack_labels(shard.labels))) == {0, 1, 2}
     assert sum(path.stat().st_size for path in folder.iterdir()) < 5e6
+
+
+def test_every_convention_is_in_the_document():
+    text = (ROOT / "docs" / "evaluation.md").read_text(encoding="utf-8")
+    assert [name for name in (*CONVENTIONS, *PLAIN_CONVENTIONS) if f"| `{name}`" not in text] == []

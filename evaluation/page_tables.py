@@ -1,0 +1,201 @@
+"""Tables of a report's page: scores by convention, differences, conventions side by side, every view."""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from .conventions import one_convention
+
+
+@dataclass(frozen=True)
+class Metric:
+    """How a number is shown.
+
+    Attributes:
+        label: heading.
+        better: 1 if higher is better, -1 if lower is, 0 if neither.
+        digits: after the point.
+    """
+
+    label: str
+    better: int
+    digits: int
+
+
+METRICS: Mapping[str, Metric] = {
+    "psnr": Metric("PSNR, dB", 1, 2),
+    "ssim": Metric("SSIM", 1, 3),
+    "lpips": Metric("LPIPS", -1, 3),
+    "flip": Metric("FLIP", -1, 3),
+    "depth_mse": Metric("depth MSE", -1, 3),
+    "disparity_mae": Metric("disparity MAE", -1, 3),
+    "normal_mean_deg": Metric("normals, mean °", -1, 1),
+    "normal_median_deg": Metric("normals, median °", -1, 1),
+    "normal_pct_30": Metric("normals within 30°", 1, 3),
+    "coverage": Metric("coverage", 0, 3),
+    "dice": Metric("Dice", 1, 3),
+    "psnr_common": Metric("PSNR on common pixels", 1, 2),
+    "coverage_common": Metric("coverage of those", 0, 3),
+    "psnr_visible": Metric("PSNR on visible pixels", 1, 2),
+    "psnr_at_coverage": Metric("PSNR at equal coverage", 1, 2),
+    "psnr_area": Metric("PSNR, mean over coverages", 1, 2),
+    "iou": Metric("IoU", 1, 3),
+    "iou_before": Metric("IoU before", 0, 3),
+    "iou_clean": Metric("IoU, untouched", 1, 3),
+    "floater_recall": Metric("ghosts removed", 1, 3),
+    "floater_precision": Metric("of the removed, ghosts", 1, 3),
+    "surface_kept": Metric("surface kept", 1, 3),
+    "free_space_error": Metric("free-space error", -1, 3),
+    "seconds": Metric("seconds", -1, 1),
+    "milliseconds": Metric("ms", -1, 1),
+    "megabytes": Metric("MB", -1, 2),
+}
+OWN_KEYS = tuple(key for key in METRICS if not key.startswith(("psnr_", "coverage_")))
+EQUAL_KEYS = ("psnr_common", "coverage_common", "psnr_visible", "psnr_at_coverage", "psnr_area")
+LABEL_KEYS = ("scene", "seed")
+ARROWS = {1: "\N{NO-BREAK SPACE}↑", -1: "\N{NO-BREAK SPACE}↓", 0: ""}
+
+
+def text(value: Any) -> str:
+    """Anything as HTML text."""
+    return html.escape(str(value), quote=True)
+
+
+def number(value: Any, digits: int, *, infinite: bool = False) -> str:
+    """A number, ∞ where the stored null stands for it, a dash for none."""
+    if value is None or isinstance(value, str):
+        return "∞" if infinite else "–"
+    if not math.isfinite(value):
+        return "∞" if value > 0 else "–"
+    shown = f"{value:.{digits}f}"
+    return (shown if float(shown) else shown.removeprefix("-")).replace("-", "−")
+
+
+def heading(key: str) -> str:
+    """A metric's label with an arrow towards better."""
+    known = METRICS.get(key)
+    return text(key) if known is None else text(known.label + ARROWS[known.better])
+
+
+def table(heads: Sequence[str], rows: Sequence[Sequence[str]], *, kind: str = "") -> str:
+    """A table of cells that are HTML already; it scrolls sideways where the screen is narrow."""
+    top = "".join(f'<th scope="col">{head}</th>' for head in heads)
+    body = "".join(
+        "<tr>" + "".join(f"<td>{cell}</td>" if n else f'<th scope="row">{cell}</th>' for n, cell in enumerate(row))
+        + "</tr>"
+        for row in rows
+    )  # fmt: skip
+    inner = f"<table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table>"
+    return f'<div class="scroll {kind}" tabindex="0">{inner}</div>'
+
+
+def by_convention(rows: Sequence[Mapping[str, Any]]) -> dict[Any, list[Mapping[str, Any]]]:
+    """Rows apart by their convention, in the order of first appearance; None: they state none."""
+    groups: dict[Any, list[Mapping[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault(row.get("convention"), []).append(row)
+    return groups
+
+
+def present(rows: Sequence[Mapping[str, Any]], keys: Sequence[str], *, at_least: int = 1) -> list[str]:
+    """Those keys that so many rows have a number for."""
+    return [key for key in keys if sum(_has(row, key) for row in rows) >= at_least]
+
+
+def score_table(
+    rows: Sequence[Mapping[str, Any]], keys: Sequence[str], swatch: Callable[[str], str] | None = None
+) -> str:
+    """Methods by metrics, the interval below its mean; rows of two conventions are refused.
+
+    Args:
+        rows: of one convention.
+        keys: the columns; those without any number are left out.
+        swatch: HTML before a method's name, as the charts colour it.
+    """
+    one_convention("score_table", rows)
+    columns, labels = present(rows, keys), [key for key in LABEL_KEYS if any(key in row for row in rows)]
+    if not columns:
+        return ""
+    cells = []
+    for row in rows:
+        name = text(row["method"])
+        cells.append([
+            name if swatch is None else swatch(str(row["method"])) + name,
+            *(text("–" if row.get(key) is None else row[key]) for key in labels),
+            *(_score(row, key) for key in columns),
+        ])  # fmt: skip
+    return table(["method", *labels, *map(heading, columns)], cells)
+
+
+def difference_table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Paired differences, a line a metric; an interval without 0 is marked."""
+    one_convention("difference_table", rows)
+    cells = []
+    for row in rows:
+        known = METRICS.get(row["metric"], Metric(row["metric"], 0, 3))
+        low, high, mean = row["low"], row["high"], row["difference"]
+        verdict = "one image" if low is None else "no difference shown"
+        if low is not None and (low > 0 or high < 0):
+            verdict = ("better" if mean * known.better > 0 else "worse") if known.better else "differs"
+        interval = "–" if low is None else f"{_signed(low, known.digits)} … {_signed(high, known.digits)}"
+        cells.append([
+            f"{text(row['method'])} − {text(row['against'])}", text(known.label), _signed(mean, known.digits), interval,
+            f'<span class="verdict {verdict.split()[0]}">{verdict}</span>', str(row["images"]),
+        ])  # fmt: skip
+    return table(["", "metric", "difference", "interval", "", "views"], cells, kind="names verdicts")
+
+
+def convention_table(rows: Sequence[Mapping[str, Any]], own: str | None) -> str:
+    """One method's renders under each convention: a line a convention, a column a metric, never averaged."""
+    names = [key for key in rows[0] if key not in ("metric", "spread")]
+    kept = [row for row in rows if any(row[name] is not None for name in names)]
+    heads = ["convention", *(heading(row["metric"]) for row in kept)]
+    cells = []
+    for name in names:
+        label = f"<b>{text(name)}</b>" if name == own else text(name)
+        cells.append([label, *(number(row[name], _digits(row["metric"])) for row in kept)])
+    spread = ["<i>largest less smallest</i>", *(number(row["spread"], _digits(row["metric"])) for row in kept)]
+    return table(heads, [*cells, spread])
+
+
+def image_table(rows: Sequence[Mapping[str, Any]], order: Sequence[str], keys: Sequence[str]) -> str:
+    """Every view of every method, in the given order of views."""
+    columns = [key for key in keys if any(_has(each, key) for row in rows for each in row["per_image"])]
+    cells = []
+    found = [{each["name"]: each for each in row["per_image"]} for row in rows]
+    for name in order:
+        for row, views in zip(rows, found):
+            each = views[name]
+            cells.append([
+                text(name), text(row["method"]), str(each["pixels"]),
+                *(number(each.get(key), _digits(key), infinite=key in each.get("infinite", ())) for key in columns),
+            ])  # fmt: skip
+    return table(["view", "method", "pixels", *map(heading, columns)], cells, kind="tall")
+
+
+def _has(row: Mapping[str, Any], key: str) -> bool:
+    value = row.get(key)
+    usable = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    return usable or key in row.get("infinite", ())
+
+
+def _score(row: Mapping[str, Any], key: str) -> str:
+    digits = _digits(key)
+    value = row.get(key) if isinstance(row.get(key), (int, float)) else None
+    shown = number(value, digits, infinite=key in row.get("infinite", ()))
+    low, high = (row.get("intervals") or {}).get(key) or (None, None)
+    if value is None or low is None or high is None:
+        return shown
+    return f"{shown}<small>{number(low, digits)} – {number(high, digits)}</small>"
+
+
+def _digits(key: str) -> int:
+    return METRICS[key].digits if key in METRICS else 3
+
+
+def _signed(value: float, digits: int) -> str:
+    return ("+" if round(value, digits) > 0 else "") + number(value, digits)

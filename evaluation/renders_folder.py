@@ -1,0 +1,283 @@
+"""Folders of pictures: anyone's renders and what they are scored against. Needs Pillow (``pip install unghost[eval]``).
+
+A folder of renders holds a colour image a view, and beside them what else was rendered (all optional)::
+
+    renders/frame_1_00001.png …           8-bit colour, PNG or JPEG
+    renders/depth/frame_1_00001.npy …     (H, W) a view; so, too, accumulation, uncertainty or confidence, and normals
+    renders/maps.npz                      or all views at once: "names" (n,) and "depth" (n, H, W) and so on
+
+Pictures belong together by their path within the folder, without its ending; or, where that does not work out for
+all of them, by their file names alone. Whatever does not match is reported together, before any picture is read.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .checks import Mask
+from .views import Renders
+
+PICTURES = (".png", ".jpg", ".jpeg")
+EIGHT_BITS = ("RGB", "L", "P", "RGBA", "LA", "PA", "1")
+KNOBS = ("confidence", "uncertainty")
+MAPS = ("depth", "accumulation", "normals", *KNOBS)
+ARCHIVE = "maps.npz"
+NAMED = 3  # of those that do not match, in a message
+
+
+@dataclass(frozen=True, eq=False)
+class Method:
+    """What one method rendered of the evaluation views.
+
+    Attributes:
+        name: of the method.
+        renders: colours and maps.
+        confidence: ``(n, H, W)``, larger is surer, no NaN where a pixel counts: a method that says how sure it is has a
+            knob, and is a curve of score over coverage instead of a point. None: it has none.
+    """
+
+    name: str
+    renders: Renders
+    confidence: NDArray[Any] | None = None
+
+
+def read_method(name: str, folder: str | Path, views: Sequence[str], shape: tuple[int, int]) -> Method:
+    """Read a folder of renders (see the module).
+
+    Args:
+        name: of the method.
+        folder: its renders.
+        views: what the views are called; an ending (``images/a.jpg``) is left aside.
+        shape: ``(height, width)`` that all must have.
+
+    Raises:
+        FileNotFoundError: no such folder.
+        ValueError: renders that are missing, too many, of another size or no 8-bit colours; maps that do not fit, or
+            hold values that cannot be: NaN depth (counted).
+    """
+    source = Path(folder)
+    found = _pictures(source, skip=MAPS)
+    paths = [found[key] for key in match_names("renders", list(found), views, where=str(source))]
+    maps = {key: _one_map(source, key, views, shape) for key in MAPS}
+    colours = _stack(paths, shape)
+    both = [key for key in KNOBS if maps[key] is not None]
+    if len(both) > 1:
+        raise ValueError(f"read_method: {source} has both confidence and uncertainty maps; keep one")
+    confidence = None
+    if both:
+        values = maps[both[0]]
+        confidence = values if both[0] == "confidence" else -values
+    try:
+        renders = Renders(colours, maps["depth"], maps["accumulation"], maps["normals"])
+    except ValueError as error:
+        raise ValueError(f"{error} (in {source})") from None
+    return Method(name, renders, confidence)
+
+
+def read_photos(
+    folder: str | Path, views: Sequence[str] | None = None, *, downscale: float = 1.0
+) -> tuple[tuple[str, ...], NDArray[np.float32]]:
+    """Photos of a folder, in the order of their names or of ``views``.
+
+    Args:
+        folder: PNG or JPEG, in folders below it too.
+        views: only these; None: all there are.
+        downscale: stored pixels to one of the result, along each axis, >= 1; the size is rounded to whole pixels.
+
+    Returns:
+        The names ``(n,)`` and ``(n, H, W, 3)`` float32 sRGB in [0, 1], box-filtered.
+
+    Raises:
+        FileNotFoundError: no such folder.
+        ValueError: no photo, photos of ``views`` that are missing, of two sizes, transparent or undecodable.
+    """
+    if not downscale >= 1:
+        raise ValueError(f"read_photos: downscale must be >= 1, got {downscale}")
+    source = Path(folder)
+    found = _pictures(source)
+    names = tuple(found) if views is None else tuple(views)
+    keys = names if views is None else match_names("photos", list(found), names, where=str(source), whole=False)
+    paths = [found[key] for key in keys]
+    sizes = {_size(path) for path in paths}
+    if len(sizes) > 1:
+        raise ValueError(f"read_photos: the photos of {source} must have one size, got {_listed(map(_times, sizes))}")
+    width, height = sizes.pop()
+    shape = max(1, round(height / downscale)), max(1, round(width / downscale))
+    return names, _stack(paths, shape, resize=True)
+
+
+def read_masks(folder: str | Path, views: Sequence[str], shape: tuple[int, int]) -> Mask:
+    """White-on-black mask pictures, a view each: ``(n, H, W)`` bool, from half of white on a pixel counts.
+
+    ``images_a.png.mask.png``, as ``unghost masks`` names them, belongs to view ``images/a.png``.
+    """
+    source = Path(folder)
+    flat = {view.replace("/", "_"): view for view in views}
+    plain = {key.removesuffix(".mask"): path for key, path in _pictures(source).items()}
+    found = {_stem(flat.get(key, key)): path for key, path in plain.items()}
+    keys = match_names("masks", list(found), views, where=str(source), whole=False)
+    return np.asarray(_stack([found[key] for key in keys], shape).mean(axis=-1) >= 0.5, dtype=np.bool_)
+
+
+def match_names(
+    what: str, given: Sequence[str], views: Sequence[str], *, where: str, whole: bool = True
+) -> tuple[str, ...]:
+    """Which of the given names belongs to each view: by path without ending, else by file name alone.
+
+    Args:
+        what: for the message.
+        given: names without endings.
+        views: names with or without endings.
+        where: for the message.
+        whole: more names than views are a mistake, too.
+
+    Raises:
+        ValueError: views without a name, or names without a view: counted, the first few of each named.
+    """
+    best: tuple[list[str], list[str]] | None = None
+    for key in (_stem, lambda name: PurePosixPath(_stem(name)).name):
+        there, wanted = {key(name): name for name in reversed(given)}, [key(view) for view in views]
+        if len(there) != len(given) or len(set(wanted)) != len(wanted):
+            continue  # two in different folders share a file name
+        missing = [view for view, each in zip(views, wanted) if each not in there]
+        surplus = [name for each, name in there.items() if each not in set(wanted)][::-1] if whole else []
+        if not missing and not surplus:
+            return tuple(there[each] for each in wanted)
+        if best is None or len(missing) + len(surplus) < len(best[0]) + len(best[1]):
+            best = missing, surplus
+    missing, surplus = best or ([], [])
+    said = [f"{len(missing)} of {len(views)} views have none ({_listed(missing)})"] if missing else []
+    said += [f"{len(surplus)} belong to no view ({_listed(surplus)})"] if surplus else []
+    raise ValueError(f"match_names: {what} in {where} do not match the views: {'; '.join(said) or 'names repeat'}")
+
+
+def _stem(name: str) -> str:
+    path = PurePosixPath(name)
+    return path.with_suffix("").as_posix() if path.suffix.lower() in (*PICTURES, ".npy") else path.as_posix()
+
+
+def _listed(names: Any) -> str:
+    listed = sorted(map(str, names))
+    return ", ".join(listed[:NAMED]) + (", …" if len(listed) > NAMED else "")
+
+
+def _pictures(folder: Path, skip: Sequence[str] = ()) -> dict[str, Path]:
+    """Name without ending -> path, in the order of names; folders in ``skip`` are left out."""
+    if not folder.is_dir():
+        raise FileNotFoundError(f"no folder {folder}")
+    found: dict[str, Path] = {}
+    for path in sorted(folder.rglob("*")):
+        inner = path.relative_to(folder)
+        if path.suffix.lower() not in PICTURES or inner.parts[0] in skip or not path.is_file():
+            continue
+        name = inner.with_suffix("").as_posix()
+        if name in found:
+            raise ValueError(f"{folder} has {name} twice: {found[name].name} and {path.name}")
+        found[name] = path
+    if not found:
+        raise ValueError(f"{folder} holds no pictures ({', '.join(PICTURES)})")
+    return found
+
+
+def _one_map(folder: Path, key: str, views: Sequence[str], shape: tuple[int, int]) -> Any:
+    """``(n, H, W)`` (normals: ``(n, H, W, 3)``) of one kind of map, or None."""
+    below, archive = folder / key, folder / ARCHIVE
+    wanted = (*shape, 3) if key == "normals" else shape
+    if archive.is_file():
+        names, values = _archive(archive, key)
+        if values is not None:
+            chosen = match_names(f"{key} maps", names, views, where=str(archive), whole=False)
+            position = {name: index for index, name in enumerate(names)}
+            return _checked(f"{key} in {archive}", values[[position[name] for name in chosen]], wanted)
+    if not below.is_dir():
+        return None
+    found = {path.relative_to(below).with_suffix("").as_posix(): path for path in sorted(below.rglob("*.npy"))}
+    if not found:
+        return None  # pictures for people
+    chosen = match_names(f"{key} maps", list(found), views, where=str(below), whole=False)
+    return np.stack([_checked(str(found[name]), _load(found[name])[None], wanted)[0] for name in chosen])
+
+
+def _archive(path: Path, key: str) -> tuple[list[str], Any]:
+    loaded: Mapping[str, Any] = _load(path)
+    foreign = set(loaded) - {"names", *MAPS}
+    if foreign:
+        raise ValueError(f"{path} holds {_listed(foreign)}; it may hold names, {', '.join(MAPS)}")
+    if key not in loaded:
+        return [], None
+    names, values = loaded.get("names"), loaded[key]
+    if names is None or names.dtype.kind != "U" or names.ndim != 1 or len(names) != len(values):
+        raise ValueError(f"{path} must hold names, one text for each of the {len(values)} maps of {key}")
+    return [str(name) for name in names], values
+
+
+def _load(path: Path) -> Any:
+    try:
+        loaded = np.load(path, allow_pickle=False)
+        return loaded if isinstance(loaded, np.ndarray) else {name: loaded[name] for name in loaded.files}
+    except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path} is no .npy or .npz of numbers and text ({type(error).__name__})") from None
+
+
+def _checked(where: str, values: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+    if values.shape[1:] != shape or not np.issubdtype(values.dtype, np.floating):
+        raise ValueError(f"{where} must be floating point of shape {shape} a view, got {values.dtype} "
+                         f"{values.shape[1:]}")  # fmt: skip
+    return values
+
+
+def _times(size: tuple[int, int]) -> str:
+    return f"{size[0]} x {size[1]}"
+
+
+def _size(path: Path) -> tuple[int, int]:
+    image = _pillow()
+    try:
+        with image.open(path) as picture:
+            return int(picture.width), int(picture.height)
+    except (OSError, image.DecompressionBombError) as error:
+        raise ValueError(f"cannot read {path} ({error})") from None
+
+
+def _stack(paths: Sequence[Path], shape: tuple[int, int], *, resize: bool = False) -> NDArray[np.float32]:
+    """``(n, H, W, 3)`` float32 in [0, 1]; pictures of another size are refused together unless resized."""
+    wanted = shape[1], shape[0]
+    other = [(path, _size(path)) for path in paths if not resize and _size(path) != wanted]
+    if other:
+        factor = wanted[0] / other[0][1][0]
+        hint = f"; the photos are {factor:.4g} times as wide (see downscale)" if factor > 1 else ""
+        raise ValueError(
+            f"{len(other)} of {len(paths)} pictures in {other[0][0].parent} are not {_times(wanted)} as the photos "
+            f"are: {_listed(f'{path.name} is {_times(size)}' for path, size in other)}{hint}"
+        )
+    return np.stack([_read(path, wanted) for path in paths])
+
+
+def _read(path: Path, size: tuple[int, int]) -> NDArray[np.float32]:
+    image = _pillow()
+    try:
+        with image.open(path) as picture:
+            if picture.mode not in EIGHT_BITS:
+                raise ValueError(f"{path} has pixels of kind {picture.mode}, not 8-bit colours")
+            if picture.mode in ("RGBA", "LA", "PA") and picture.getchannel("A").getextrema()[0] < 255:
+                raise ValueError(f"{path} has transparent pixels; put it on a background first")
+            plain = picture.convert("RGB")
+            small = plain if plain.size == size else plain.resize(size, image.Resampling.BOX)
+            return np.asarray(small, dtype=np.float32) / np.float32(255)
+    except (OSError, image.DecompressionBombError) as error:
+        raise ValueError(f"cannot decode {path} ({error})") from None
+
+
+def _pillow() -> Any:
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise ImportError("reading pictures needs Pillow: pip install unghost[eval]") from error
+    return Image
