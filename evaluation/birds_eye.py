@@ -38,7 +38,15 @@ def ground_plane(*sweeps: Cameras) -> NDArray[np.float64]:
     return np.stack([first, np.cross(up, first)])
 
 
-def draw_birds_eye(path: str | Path, train: Cameras, evaluation: Cameras, *, title: str = "", n: int = 8) -> None:
+def draw_birds_eye(
+    path: str | Path,
+    train: Cameras,
+    evaluation: Cameras,
+    *,
+    title: str = "",
+    heading: str = "scored on the other sweep",
+    n: int | None = 8,
+) -> None:
     """Draw both sweeps from above and, beside them, what holding out every n-th training photo would test.
 
     A dot is a camera (black: training, red: scored), its tick the way it looks, a grey line the way from a scored one
@@ -48,7 +56,8 @@ def draw_birds_eye(path: str | Path, train: Cameras, evaluation: Cameras, *, tit
         path: of the PNG.
         train, evaluation: in one world.
         title: above the picture.
-        n: of the panel on the right, which is left out if ``train`` has one photo.
+        heading: of the panel with both sweeps.
+        n: of the panel on the right, which is left out with None, or if ``train`` has one photo.
 
     Raises:
         ImportError: matplotlib is missing.
@@ -60,9 +69,9 @@ def draw_birds_eye(path: str | Path, train: Cameras, evaluation: Cameras, *, tit
         raise ImportError("draw_birds_eye needs matplotlib: pip install unghost[eval]") from error
     unit, plane = normalising_factor(train, evaluation), ground_plane(train, evaluation)
     center = np.concatenate([train.origins, evaluation.origins]).mean(axis=0)
-    taught, held_out = every_nth(len(train), n=n)
-    panels = [("scored on the other sweep", train, evaluation)]
-    if len(taught):
+    panels = [(heading, train, evaluation)]
+    if n is not None and len(train) > 1:
+        taught, held_out = every_nth(len(train), n=n)
         panels.append((f"scored on every {n}th training photo", train.select(taught), train.select(held_out)))
     around = (np.concatenate([train.origins, evaluation.origins]) - center) @ plane.T * unit
     low, high = around.min(axis=0) - 1.5 * TICK, around.max(axis=0) + 1.5 * TICK
@@ -71,14 +80,14 @@ def draw_birds_eye(path: str | Path, train: Cameras, evaluation: Cameras, *, tit
     FigureCanvasAgg(figure)
     figure.suptitle(title, fontsize=12, weight="bold", color="#222222")
     grid = figure.subplots(1, len(panels), squeeze=False)
-    for axes, (heading, black, red) in zip(grid[0], panels):
+    for axes, (told, black, red) in zip(grid[0], panels):
         found = difficulty(black, red, factor=unit)
         _panel(axes, [((each.origins - center) @ plane.T * unit, -each.camera_to_world[:, :, 2] @ plane.T)
                       for each in (black, red)], found)  # fmt: skip
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
         axes.set_xlabel("seen from above, normalised units", fontsize=8.5, color="#555555")
         means = f"mean to nearest: {found.translation.mean():.2f}, {found.rotation_deg.mean():.1f}°"
-        axes.set_title(f"{heading}\n{means}", fontsize=10, color="#222222")
+        axes.set_title(f"{told}\n{means}", fontsize=10, color="#222222")
     figure.legend(
         *grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=9, frameon=False
     )

@@ -59,6 +59,16 @@ class Capture:
     def __len__(self) -> int:
         return len(self.names)
 
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """Where each photo is."""
+        return self._paths
+
+    def photo_size(self, index: int) -> tuple[int, int]:
+        """Width and height of a photo as it is stored."""
+        with _pillow().open(self._paths[index]) as photo:
+            return int(photo.width), int(photo.height)
+
     def split(self, name: str) -> NDArray[np.int64]:
         """Indices ``(n,)`` of the photos of one sweep, in its order; ``"all"`` is every photo.
 

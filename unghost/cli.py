@@ -22,12 +22,22 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     import tyro
 
-    from . import commands, commands_clean, commands_masks, commands_prior, commands_recipes, commands_sample
+    from . import (
+        commands,
+        commands_capture,
+        commands_clean,
+        commands_masks,
+        commands_prior,
+        commands_recipes,
+        commands_sample,
+    )
 
     verbs: dict[str, Callable[..., Any]] = {
         "demo": commands.demo,
         "clean": commands_clean.clean,
         "masks": commands_masks.masks,
+        "capture": commands_capture.capture,
+        "convert": commands_capture.convert,
         "bench": commands.bench,
         "curate": commands_recipes.curate,
         "harvest": commands_recipes.harvest,

@@ -9,7 +9,10 @@ from unghost.core.packing import pack_labels
 from unghost.core.shards import write_shard
 from unghost.grids import load_grid, save_grid
 
-VERBS = ("demo", "clean", "masks", "bench", "curate", "harvest", "preview", "train", "sample", "export", "verify")
+VERBS = (
+    "demo", "clean", "masks", "capture", "convert", "bench", "curate", "harvest", "preview", "train", "sample",
+    "export", "verify",
+)  # fmt: skip
 
 
 def small_shard(folder, count):
