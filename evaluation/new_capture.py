@@ -52,7 +52,8 @@ def make_capture(
     sources = {"train": Path(train), "eval": Path(evaluation)}
     for sweep, source in sources.items():
         if not source.exists():
-            raise FileNotFoundError(f"make_capture: no video or folder {source} to {sweep} on")
+            purpose = "to train on" if sweep == "train" else "to be scored on"
+            raise FileNotFoundError(f"make_capture: no video or folder {source} {purpose}")
     with new_folder(Path(out)) as partial:
         images = partial / "images"
         taken = {

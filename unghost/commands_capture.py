@@ -19,8 +19,8 @@ def capture(
 ) -> None:  # fmt: skip
     """Make a capture from two videos (or two folders of photos): one to train on, one to be scored on.
 
-    The sharpest frames are kept, both sweeps are posed together by COLMAP (on the CPU; 2 x 100 frames take tens of
-    minutes on two cores), and the folder can be read by unghost and by stock nerfstudio.
+    The sharpest frames are kept, both sweeps are posed together by COLMAP (on the CPU; 2 x 100 frames take half an
+    hour or more on two cores), and the folder can be read by unghost and by stock nerfstudio.
 
     Args:
         train: video or folder of photos to train on.
@@ -47,9 +47,11 @@ def capture(
     bars: dict[str, Any] = {}
 
     def progress(stage: str, done: int, total: int) -> None:
-        bar = bars.setdefault(stage, None) or tqdm(total=total, desc=stage, unit="")
-        bars[stage] = bar
-        bar.update(done - bar.n)
+        if stage not in bars:
+            bars[stage] = tqdm(total=total, desc=stage, unit="pair" if stage == "pairs" else "photo")
+        bars[stage].update(done - bars[stage].n)
+        if done == total:
+            bars[stage].close()
 
     try:
         told = make_capture(train, evaluation, out, frames=frames, settings=settings, progress=progress)

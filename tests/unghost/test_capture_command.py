@@ -102,7 +102,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(case, tmp_path, capsys, monkey
     assert run("capture", *words, "--out", "out", *extra) == 2
     error = capsys.readouterr().err.splitlines()[-1]  # what stands before are progress bars
     message = {
-        "gone": "no video or folder z to eval on", "broken": "cannot read c.mp4 as a video",
+        "gone": "no video or folder z to be scored on", "broken": "cannot read c.mp4 as a video",
         "empty": "no photos in b (looked for .jpg", "sizes": "train 96 x 96, eval 128 x 96",
         "in use": "out is there already and not empty", "plot": "--plot must end in .png",
         "blank": "COLMAP posed no photos (train 0 of 3, eval 0 of 3)",
