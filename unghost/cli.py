@@ -24,6 +24,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     from . import (
         commands,
+        commands_capture,
         commands_clean,
         commands_evaluate,
         commands_masks,
@@ -36,6 +37,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         "demo": commands.demo,
         "clean": commands_clean.clean,
         "masks": commands_masks.masks,
+        "capture": commands_capture.capture,
+        "convert": commands_capture.convert,
         "evaluate": commands_evaluate.evaluate,
         "report": commands_evaluate.report,
         "bench": commands.bench,

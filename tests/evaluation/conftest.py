@@ -1,3 +1,6 @@
+import importlib.util
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -11,3 +14,12 @@ def pattern():
     target = np.stack([(np.sin(0.31 * row) + 1) / 2, wave, checks * 0.8 + 0.1], axis=-1)
     preds = np.stack([(np.sin(0.31 * row + 0.4) + 1) / 2, wave * 0.9, checks * 0.6 + 0.2], axis=-1)
     return preds, target
+
+
+@pytest.fixture(scope="session")
+def room():
+    """The module ``textured_room.py`` beside this file."""
+    spec = importlib.util.spec_from_file_location("textured_room", Path(__file__).with_name("textured_room.py"))
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module

@@ -210,6 +210,48 @@ def test_what_is_wrong_is_named(tmp_path, changes, message):
         load_capture(_write(tmp_path / "c", **changes))
 
 
+def test_photos_that_are_not_there_are_reported_together_or_dropped(tmp_path):
+    folder = _write(tmp_path / "c", splits={"one": ["images/0.png", "images/1.png"], "two": ["images/2.png"]})
+    whole = load_capture(folder, downscale=1, normalize=False)
+    assert whole.dropped == ()
+    (folder / "images" / "0.png").unlink()
+    with pytest.raises(ValueError, match="missing must be one of error, drop, got 'ignore'"):
+        load_capture(folder, missing="ignore")
+    with pytest.warns(UserWarning, match=r"1 of the 3 photos .*: images/0\.png; left out"):
+        rest = load_capture(folder, downscale=1, normalize=False, missing="drop")
+    assert rest.dropped == ("images/0.png",)
+    assert rest.names == ("images/1.png", "images/2.png")
+    assert {name: indices.tolist() for name, indices in rest.splits.items()} == {"one": [0], "two": [1]}
+    np.testing.assert_array_equal(rest.cameras.camera_to_world, whole.cameras.camera_to_world[1:])
+    np.testing.assert_array_equal(rest.images(), whole.images([1, 2]))
+    (folder / "images" / "2.png").unlink()
+    with pytest.raises(FileNotFoundError, match=r"2 of the 3 photos .*: images/0\.png, images/2\.png \(missing="):
+        load_capture(folder)
+    (folder / "images" / "1.png").unlink()
+    with pytest.raises(FileNotFoundError, match="3 of the 3 photos"):
+        load_capture(folder, missing="drop")
+
+
+def test_normalisation_over_named_sweeps(tmp_path):
+    folder = _write(tmp_path / "c", splits={"a": ["images/0.png"], "b": ["images/1.png"], "c": ["images/2.png"]})
+    capture = load_capture(folder, downscale=1, normalize=("a", "b"))
+    # origins (1,2,3), (3,2,3): mean (2,2,3), farthest coordinate 1; the third, (2,6,3), lies 4 away
+    np.testing.assert_allclose(capture.cameras.origins, [[-1, 0, 0], [1, 0, 0], [0, 4, 0]], atol=1e-12)
+    assert load_capture(folder, normalize="a").scale_factor == 1.0
+    for names in (("a", "z"), ()):
+        with pytest.raises(ValueError, match=r"normalize names no sweep: .*choose from a, b, c"):
+            load_capture(folder, normalize=names)
+
+
+@pytest.mark.parametrize(("model", "k1", "k2"), [("SIMPLE_RADIAL", 0.03, 0.0), ("RADIAL", 0.03, 0.1)])
+def test_radial_lenses_are_understood(tmp_path, model, k1, k2):
+    _write(tmp_path / "c", meta={"camera_model": model, "k1": k1, "k2": k2})
+    np.testing.assert_array_equal(load_capture(tmp_path / "c").cameras.distortion[0], [k1, k2, 0, 0, 0, 0])
+    _write(tmp_path / "d", meta={"camera_model": model, "k1": k1, "p1": 0.1})
+    with pytest.raises(ValueError, match="distortion"):
+        load_capture(tmp_path / "d")
+
+
 def test_missing_files_are_named(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"no folder .*nowhere"):
         load_capture(tmp_path / "nowhere")
@@ -218,7 +260,10 @@ def test_missing_files_are_named(tmp_path):
         load_capture(tmp_path / "empty")
     _write(tmp_path / "c")
     (tmp_path / "c" / "images" / "1.png").unlink()
-    with pytest.raises(FileNotFoundError, match=r"no photo .*1\.png"):
+    with pytest.raises(
+        FileNotFoundError,
+        match=r"1 of the 3 photos that transforms\.json names are not in .*: images/1\.png \(missing='drop'",
+    ):
         load_capture(tmp_path / "c")
 
 

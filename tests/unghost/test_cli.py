@@ -10,20 +10,9 @@ from unghost.core.shards import write_shard
 from unghost.grids import load_grid, save_grid
 
 VERBS = (
-    "demo",
-    "clean",
-    "masks",
-    "evaluate",
-    "report",
-    "bench",
-    "curate",
-    "harvest",
-    "preview",
-    "train",
-    "sample",
-    "export",
-    "verify",
-)
+    "demo", "clean", "masks", "capture", "convert", "evaluate", "report", "bench", "curate", "harvest", "preview",
+    "train", "sample", "export", "verify",
+)  # fmt: skip
 
 
 def small_shard(folder, count):

@@ -6,7 +6,10 @@ import textwrap
 
 import pytest
 
-ABSENT = ("torch", "onnx", "onnxscript", "safetensors", "trimesh", "open3d", "scipy", "skimage", "matplotlib", "PIL")
+ABSENT = (
+    "torch", "onnx", "onnxscript", "safetensors", "trimesh", "open3d", "scipy", "skimage", "matplotlib", "PIL",
+    "pycolmap", "av",
+)  # fmt: skip
 BLOCKER = f"""
 import sys
 

@@ -1,0 +1,98 @@
+"""A capture from two videos or two folders of photos, as the paper has it: one to train on, one to be scored on."""
+
+from __future__ import annotations
+
+import json
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from .captures import load_capture
+from .frames import Extraction, extract_frames
+from .nerfstudio_folder import file_lists, write_splits
+from .new_folder import new_folder
+from .posing import Posing, PosingSettings, Progress, pose_jointly
+from .transforms_file import write_transforms
+
+PREFIXES = {"train": "frame_", "eval": "frame_1_"}  # the names of the released Nerfbusters captures
+MODEL = "sparse/0"
+
+
+def make_capture(
+    train: str | Path,
+    evaluation: str | Path,
+    out: str | Path,
+    *,
+    frames: int = 100,
+    settings: PosingSettings | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Extract the sharpest frames of two sweeps, pose them jointly, and write a folder that ``load_capture`` reads.
+
+    So does stock nerfstudio: ``transforms.json`` has its file lists. Photos are named as in the released Nerfbusters
+    captures, ``images/frame_00001.jpg`` and ``images/frame_1_00001.jpg``; those without a pose lie there too. COLMAP's
+    model and its points are in ``sparse/0``, in the same world: COLMAP's, of which neither the unit nor "up" is known.
+
+    Args:
+        train, evaluation: a video, or a folder of photos, each. All pictures must have one size.
+        out: must not exist, or be empty. Written whole or not at all.
+        frames: at most so many are kept of each sweep.
+        settings: of the posing.
+        progress: as in :func:`~unghost.evaluation.posing.pose_jointly`.
+
+    Returns:
+        what ``capture.json`` in the folder says: per sweep its ``source``, how many pictures it ``seen`` had, were
+        ``kept`` and ``posed``; ``unposed`` names, ``reprojection_error`` in pixels, ``points``, ``frames`` (what each
+        photo was in its source), ``versions`` and ``seed``.
+
+    Raises:
+        FileNotFoundError, ValueError, ImportError: of the steps.
+    """
+    how = settings or PosingSettings()
+    sources = {"train": Path(train), "eval": Path(evaluation)}
+    for sweep, source in sources.items():
+        if not source.exists():
+            purpose = "to train on" if sweep == "train" else "to be scored on"
+            raise FileNotFoundError(f"make_capture: no video or folder {source} {purpose}")
+    with new_folder(Path(out)) as partial:
+        images = partial / "images"
+        taken = {
+            sweep: extract_frames(source, images, prefix=PREFIXES[sweep], count=frames)
+            for sweep, source in sources.items()
+        }
+        sizes = {sweep: f"{found.size[0]} x {found.size[1]}" for sweep, found in taken.items()}
+        if len(set(sizes.values())) > 1:
+            raise ValueError(
+                f"make_capture: both sweeps must have pictures of one size, got train {sizes['train']}, eval "
+                f"{sizes['eval']}; record both alike, or resize one"
+            )
+        names = {sweep: [path.name for path in found.paths] for sweep, found in taken.items()}
+        posing = pose_jointly(images, names, out=partial / MODEL, settings=how, progress=progress)
+        sweeps = {sweep: [f"images/{name}" for name in found] for sweep, found in posing.posed.items()}
+        capture = load_capture(partial, downscale=1, normalize=False, splits=sweeps)
+        write_transforms(
+            partial / "transforms.json", capture.cameras, capture.names,
+            file_lists(sweeps["train"], sweeps["eval"]), ply_file_path=f"{MODEL}/points3D.ply",
+        )  # fmt: skip
+        write_splits(partial / "splits.json", sweeps)
+        told = _told(sources, taken, posing, how)
+        (partial / "capture.json").write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+    return told
+
+
+def _told(
+    sources: dict[str, Path], taken: dict[str, Extraction], posing: Posing, how: PosingSettings
+) -> dict[str, Any]:
+    """How the capture came about; names of files only, not where they lay."""
+    return {
+        **{
+            sweep: {
+                "source": source.name, "seen": taken[sweep].seen, "kept": len(taken[sweep].paths),
+                "posed": len(posing.posed[sweep]),
+            }
+            for sweep, source in sources.items()
+        },
+        "unposed": list(posing.unposed), "reprojection_error": posing.reprojection_error, "points": posing.points,
+        "seed": how.seed, "versions": {name: version(name) for name in ("pycolmap", "av")},
+        "frames": {path.name: was for each in taken.values() for path, was in zip(each.paths, each.sources)},
+    }  # fmt: skip

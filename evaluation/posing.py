@@ -1,0 +1,213 @@
+"""Joint poses of several sweeps of one scene by COLMAP's incremental mapping (``pip install unghost[capture]``)."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+from .colmap import quiet_pycolmap
+
+Progress = Callable[[str, int, int], None]
+EXTRACT_AT_ONCE, MATCH_AT_ONCE = 8, 500  # photos and pairs between two reports of progress
+SMALLEST_PART = 3  # photos
+
+
+@dataclass(frozen=True)
+class PosingSettings:
+    """How :func:`pose_jointly` works.
+
+    Attributes:
+        one_lens: all sweeps share one lens (same camera, same zoom and focus); else each has its own.
+        longest_side: features are looked for in photos shrunk to this many pixels.
+        minimum_share: of the photos of each sweep that must get a pose.
+        seed: of COLMAP's random choices; the same again gives the same poses on one thread, and nearly the same on
+            several.
+        threads: 0 for one per core.
+    """
+
+    one_lens: bool = False
+    longest_side: int = 1600
+    minimum_share: float = 0.5
+    seed: int = 0
+    threads: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuse what makes no sense."""
+        if not 0 < self.minimum_share <= 1:
+            raise ValueError(f"PosingSettings: minimum_share must be in (0, 1], got {self.minimum_share}")
+        if self.longest_side < 64:
+            raise ValueError(f"PosingSettings: longest_side must be >= 64 pixels, got {self.longest_side}")
+        if self.seed < 0 or self.threads < 0:
+            raise ValueError(f"PosingSettings: seed and threads must be >= 0, got {self.seed} and {self.threads}")
+
+
+@dataclass(frozen=True)
+class Posing:
+    """What :func:`pose_jointly` found.
+
+    Attributes:
+        posed: sweep -> names of its photos that have a pose.
+        unposed: the other photos.
+        reprojection_error: mean distance in pixels between a point's projection and the feature it stands for.
+        points: how many points were triangulated.
+    """
+
+    posed: Mapping[str, tuple[str, ...]]
+    unposed: tuple[str, ...]
+    reprojection_error: float
+    points: int
+
+
+def pose_jointly(
+    folder: str | Path,
+    sweeps: Mapping[str, Sequence[str]],
+    *,
+    out: str | Path,
+    settings: PosingSettings | None = None,
+    progress: Progress | None = None,
+) -> Posing:
+    """Pose the photos of all sweeps in one world: SIFT features, every pair matched, incremental mapping, on the CPU.
+
+    Lenses are OPENCV's with k1, k2, p1, p2; the focal length to begin with comes from EXIF where there is one. Of the
+    parts that COLMAP finds, the one with most photos of those that join all sweeps is kept.
+
+    Args:
+        folder: of the photos.
+        sweeps: name -> names of photos in ``folder``; no photo in two of them.
+        out: folder for the model (``cameras.bin``, ``images.bin``, …, and its points in ``points3D.ply``).
+        settings: None for the defaults.
+        progress: called with a stage, how much of it is done, and how much there is.
+
+    Raises:
+        ImportError: pycolmap is missing.
+        ValueError: no part has enough photos of every sweep; says how many each part has of each.
+    """
+    how = settings or PosingSettings()
+    names = [name for photos in sweeps.values() for name in photos]
+    if not names or len(set(names)) != len(names) or not all(sweeps.values()):
+        raise ValueError(f"pose_jointly: sweeps must have a photo each and share none, got {dict(sweeps)}")
+    spaced = next((name for name in names if len(name.split()) != 1), None)
+    if spaced is not None:
+        raise ValueError(f"pose_jointly: names of photos must have no spaces in them, got {spaced!r}")
+    tell = progress or (lambda stage, done, total: None)
+    with quiet_pycolmap("pose_jointly") as pycolmap, tempfile.TemporaryDirectory() as scratch:
+        database = Path(scratch, "database.db")
+        lenses = [names] if how.one_lens else [list(photos) for photos in sweeps.values()]
+        _extract(pycolmap, database, Path(folder), lenses, how, tell)
+        _match(pycolmap, database, names, how, tell)
+        parts = _map(pycolmap, database, Path(folder), Path(scratch, "parts"), len(names), how, tell)
+        counts = [_posed(part, sweeps) for part in parts]
+        enough = [
+            number for number, posed in enumerate(counts)
+            if all(len(posed[sweep]) >= how.minimum_share * len(photos) for sweep, photos in sweeps.items())
+        ]  # fmt: skip
+        if not enough:
+            raise ValueError(_complaint(counts, sweeps, how.minimum_share))
+        best = max(enough, key=lambda number: sum(map(len, counts[number].values())))
+        model, posed = parts[best], counts[best]
+        Path(out).mkdir(parents=True, exist_ok=True)
+        model.write_binary(out)
+        model.export_PLY(Path(out, "points3D.ply"))
+    found = {name for photos in posed.values() for name in photos}
+    unposed = tuple(name for name in names if name not in found)
+    return Posing(posed, unposed, float(model.compute_mean_reprojection_error()), int(model.num_points3D()))
+
+
+def _threads(how: PosingSettings) -> int:
+    return how.threads or -1
+
+
+def _extract(
+    pycolmap: Any, database: Path, folder: Path, lenses: Sequence[Sequence[str]], how: PosingSettings, tell: Progress
+) -> None:
+    """Features of all photos; those of one entry of ``lenses`` share a camera, numbered from 1."""
+    options = pycolmap.FeatureExtractionOptions(
+        use_gpu=False, num_threads=_threads(how), max_image_size=how.longest_side
+    )
+    done, total = 0, sum(map(len, lenses))
+    for camera, names in enumerate(lenses, start=1):
+        for start in range(0, len(names), EXTRACT_AT_ONCE):
+            tell("features", done, total)
+            reader = pycolmap.ImageReaderOptions(camera_model="OPENCV")
+            if start:
+                reader.existing_camera_id = camera
+            chosen = list(names[start : start + EXTRACT_AT_ONCE])
+            pycolmap.extract_features(
+                database, folder, image_names=chosen, camera_mode=pycolmap.CameraMode.SINGLE, reader_options=reader,
+                extraction_options=options, device=pycolmap.Device.cpu,
+            )  # fmt: skip
+            done += len(chosen)
+    tell("features", total, total)
+
+
+def _match(pycolmap: Any, database: Path, names: Sequence[str], how: PosingSettings, tell: Progress) -> None:
+    """Every pair of photos, some hundred at a time."""
+    options = pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=_threads(how))
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = how.seed
+    chosen = pycolmap.ImportedPairingOptions()
+    chosen.match_list_path = database.with_name("pairs.txt")
+    pairs = list(combinations(names, 2))
+    for start in range(0, len(pairs), MATCH_AT_ONCE):
+        tell("pairs", start, len(pairs))
+        lines = (f"{one} {other}\n" for one, other in pairs[start : start + MATCH_AT_ONCE])
+        database.with_name("pairs.txt").write_text("".join(lines), encoding="utf-8")
+        pycolmap.match_image_pairs(
+            database, matching_options=options, pairing_options=chosen, verification_options=verification,
+            device=pycolmap.Device.cpu,
+        )  # fmt: skip
+    tell("pairs", len(pairs), len(pairs))
+
+
+def _map(
+    pycolmap: Any, database: Path, folder: Path, parts: Path, total: int, how: PosingSettings, tell: Progress
+) -> list[Any]:
+    """The parts that hang together, each a reconstruction."""
+    options = pycolmap.IncrementalPipelineOptions(
+        random_seed=how.seed, num_threads=_threads(how), min_model_size=SMALLEST_PART
+    )
+    options.mapper.random_seed = options.triangulation.random_seed = how.seed
+    options.mapper.num_threads = _threads(how)
+    steps = _counted(total, tell)
+    parts.mkdir()
+    found = pycolmap.incremental_mapping(
+        database, folder, parts, options=options,
+        initial_image_pair_callback=lambda: (next(steps), next(steps)), next_image_callback=lambda: next(steps),
+    )  # fmt: skip
+    return [found[number] for number in sorted(found)]
+
+
+def _counted(total: int, tell: Progress) -> Iterator[None]:
+    """Tells of one photo more each time it is asked; COLMAP may begin anew, so it stops at the total."""
+    done = 0
+    while True:
+        done = min(done + 1, total)
+        tell("poses", done, total)
+        yield
+
+
+def _posed(model: Any, sweeps: Mapping[str, Sequence[str]]) -> dict[str, tuple[str, ...]]:
+    names = {photo.name for photo in model.images.values() if photo.has_pose}
+    return {sweep: tuple(name for name in photos if name in names) for sweep, photos in sweeps.items()}
+
+
+def _complaint(
+    counts: Sequence[Mapping[str, tuple[str, ...]]], sweeps: Mapping[str, Sequence[str]], share: float
+) -> str:
+    """Why no part will do."""
+    told = [", ".join(f"{sweep} {len(posed[sweep])} of {len(sweeps[sweep])}" for sweep in sweeps) for posed in counts]
+    if not told:
+        none = ", ".join(f"{sweep} 0 of {len(photos)}" for sweep, photos in sweeps.items())
+        return (
+            f"pose_jointly: COLMAP posed no photos ({none}): they must be sharp, show texture, overlap, and be taken "
+            "from different places"
+        )
+    parts = "; ".join(f"part {number}: {text}" for number, text in enumerate(told, start=1))
+    return (
+        f"pose_jointly: no part joins at least {share:.0%} of each sweep. COLMAP posed {parts}. "
+        "The sweeps must show the same things from not too different places; more frames may help"
+    )

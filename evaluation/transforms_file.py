@@ -1,0 +1,154 @@
+"""``transforms.json``, the file of poses and lenses that nerfstudio and instant-ngp read."""
+
+from __future__ import annotations
+
+import json
+import os
+import posixpath
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.cameras import Cameras
+
+DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
+LENS_KEYS = ("fl_x", "fl_y", "cx", "cy")
+BENDS = {  # camera model -> what may differ from 0 in it
+    "OPENCV": DISTORTION_KEYS, "PINHOLE": (), "SIMPLE_PINHOLE": (), "SIMPLE_RADIAL": ("k1",), "RADIAL": ("k1", "k2"),
+}  # fmt: skip
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """The object in a JSON file.
+
+    Raises:
+        ValueError: there is no such file, or it is something else.
+    """
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ValueError(f"load_capture: {path.parent} has no {path.name}: not a capture") from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"load_capture: {path} is not JSON ({error})") from None
+    if not isinstance(value, dict):
+        raise ValueError(f"load_capture: {path} must hold an object, got a {type(value).__name__}")
+    return value
+
+
+def clean_name(name: str) -> str:
+    """A ``file_path`` without ``./`` and backslashes: two spellings of one photo become equal."""
+    return posixpath.normpath(name.replace("\\", "/"))
+
+
+def first_twice(names: Sequence[str]) -> str:
+    """The first name that stood before; there must be one."""
+    seen: set[str] = set()
+    return next(name for name in names if name in seen or seen.add(name))  # type: ignore[func-returns-value]
+
+
+def read_frames(meta: Mapping[str, Any], label: str) -> tuple[list[dict[str, Any]], tuple[str, ...], NDArray[Any]]:
+    """The frames of a file, each with what it shares with the others, their names, and their poses.
+
+    Args:
+        meta: the file's object.
+        label: what to call it in an error.
+
+    Returns:
+        frames, names, OpenGL camera-to-world ``(N, 3, 4)``.
+
+    Raises:
+        ValueError: no frames, one without name or pose, a pose that is no rigid motion, a name twice.
+    """
+    frames = meta.get("frames")
+    if not isinstance(frames, list) or not frames:
+        raise ValueError(f"load_capture: {label} has no frames")
+    names = tuple(_frame_name(frame, number) for number, frame in enumerate(frames))
+    if len(set(names)) != len(names):
+        raise ValueError(f"load_capture: {first_twice(names)!r} stands in two frames of {label}")
+    poses = np.stack([_pose(frame, name) for frame, name in zip(frames, names)])
+    shared = {key: value for key, value in meta.items() if key != "frames"}
+    return [{**shared, **frame} for frame in frames], names, poses
+
+
+def _frame_name(frame: Any, number: int) -> str:
+    if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
+        raise ValueError(f"load_capture: frame {number} of transforms.json has no file_path")
+    return clean_name(frame["file_path"])
+
+
+def _pose(frame: Mapping[str, Any], name: str) -> NDArray[np.float64]:
+    if "transform_matrix" not in frame:
+        raise ValueError(f"load_capture: the frame of {name} has no transform_matrix")
+    try:
+        pose = np.array(frame["transform_matrix"], dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"load_capture: transform_matrix of {name} is not a matrix of numbers") from None
+    if pose.shape not in ((4, 4), (3, 4)):
+        raise ValueError(f"load_capture: transform_matrix of {name} must have shape (4, 4), got {pose.shape}")
+    if not np.isfinite(pose).all():
+        raise ValueError(f"load_capture: transform_matrix of {name} must be finite")
+    rotation = pose[:3, :3]
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+        raise ValueError(f"load_capture: transform_matrix of {name} must hold a rotation, got {rotation.tolist()}")
+    return pose[:3]
+
+
+def read_lens(
+    frame: Mapping[str, Any], name: str, width: int, height: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Intrinsics ``(4,)`` in pixels and OPENCV distortion ``(6,)`` of one frame of :func:`read_frames`.
+
+    Raises:
+        ValueError: a camera model that is not understood, or numbers that make no lens.
+    """
+    model = frame.get("camera_model", "OPENCV")
+    if model not in BENDS:
+        raise ValueError(f"load_capture: camera_model {model!r} of {name} is none of {', '.join(BENDS)}")
+    focal = frame.get("fl_x")
+    if focal is None and "camera_angle_x" in frame:
+        focal = 0.5 * width / np.tan(0.5 * float(frame["camera_angle_x"]))
+    if focal is None:
+        raise ValueError(f"load_capture: neither fl_x nor camera_angle_x is given for {name}")
+    lens = np.array([focal, frame.get("fl_y", focal), frame.get("cx", width / 2), frame.get("cy", height / 2)], "f8")
+    bend = np.array([frame.get(key, 0.0) for key in DISTORTION_KEYS], dtype=np.float64)
+    if not (np.isfinite(lens).all() and np.isfinite(bend).all() and (lens[:2] > 0).all()):
+        raise ValueError(f"load_capture: intrinsics of {name} must be finite with fl_x, fl_y > 0, got {lens.tolist()}")
+    if any(value and key not in BENDS[model] for key, value in zip(DISTORTION_KEYS, bend)):
+        raise ValueError(f"load_capture: {name} has distortion {bend.tolist()} but camera_model {model}")
+    return lens, bend
+
+
+def write_transforms(
+    path: str | Path, cameras: Cameras, names: Sequence[str], lists: Mapping[str, Sequence[str]], **extra: Any
+) -> None:
+    """Write the file that stock nerfstudio (1.1.5) reads, whole or not at all.
+
+    Lenses that are all the same stand once: nerfstudio lets a shared value win over a frame's own. Others stand with
+    each frame, and then none is shared.
+
+    Args:
+        path: of the file.
+        cameras: in the world and at the size of the stored photos.
+        names: of the photos, relative to the file's folder.
+        lists: ``train_filenames`` and so on; nerfstudio wants train, val and test, or none of them.
+        **extra: further keys of the file.
+    """
+    keys = (*LENS_KEYS, *DISTORTION_KEYS)
+    lenses = np.concatenate([cameras.intrinsics, cameras.distortion], axis=1)
+    alike = bool((lenses == lenses[:1]).all())
+    frames: list[dict[str, Any]] = []
+    for name, pose, lens in zip(names, cameras.camera_to_world, lenses, strict=True):
+        own = {} if alike else dict(zip(keys, lens.tolist()))
+        frames.append({"file_path": name, **own, "transform_matrix": [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]]})
+    shared = dict(zip(keys, lenses[0].tolist())) if alike else {}
+    content = {
+        "camera_model": "OPENCV", "w": cameras.width, "h": cameras.height, **shared, **extra,
+        **{key: list(files) for key, files in lists.items()}, "frames": frames,
+    }  # fmt: skip
+    target = Path(path)
+    partial = target.with_name(target.name + ".partial")
+    partial.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    os.replace(partial, target)

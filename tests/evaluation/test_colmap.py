@@ -1,0 +1,178 @@
+"""COLMAP models written by pycolmap, read as captures; its own projection is the oracle."""
+
+import shutil
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from unghost.evaluation.captures import load_cameras, load_capture
+from unghost.evaluation.colmap import find_model, read_model
+
+pycolmap = pytest.importorskip("pycolmap")
+
+WIDTH, HEIGHT = 64, 48
+PARAMETERS = {
+    "SIMPLE_PINHOLE": [60.0, 31.0, 25.0],
+    "PINHOLE": [60.0, 61.0, 31.0, 25.0],
+    "SIMPLE_RADIAL": [60.0, 31.0, 25.0, 0.05],
+    "RADIAL": [60.0, 31.0, 25.0, 0.05, -0.01],
+    "OPENCV": [60.0, 61.0, 31.0, 25.0, 0.05, -0.01, 0.002, -0.003],
+    "FULL_OPENCV": [60.0, 61.0, 31.0, 25.0, 0.05, -0.01, 0.002, -0.003, 0.0, 0.1, 0.0, 0.0],
+}
+
+
+def _pose(number):
+    """World to camera, COLMAP's way; the cameras look at the origin's neighbourhood from 4 units away."""
+    rotation = pycolmap.Rotation3d(np.array([0.1 * number, -0.2, 0.05 * number]))
+    return pycolmap.Rigid3d(rotation, np.array([0.3 * number, 0.1, 4.0]))
+
+
+def model_of(names_and_models):
+    """A reconstruction without points: a camera a photo, so that lenses differ."""
+    model = pycolmap.Reconstruction()
+    for number, (name, kind) in enumerate(names_and_models, start=1):
+        camera = pycolmap.Camera(
+            camera_id=number, model=kind, width=WIDTH, height=HEIGHT, params=np.array(PARAMETERS[kind]) + number * 1e-3
+        )
+        model.add_camera_with_trivial_rig(camera)
+        image = pycolmap.Image(name=name, camera_id=number, image_id=number)
+        model.add_image_with_trivial_frame(image, _pose(number))
+    return model
+
+
+def _write(folder, model, *, text=False, part="0"):
+    target = folder / "sparse" / part
+    target.mkdir(parents=True)
+    (model.write_text if text else model.write_binary)(target)
+    for photo in model.images.values():
+        path = folder / "images" / photo.name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", (WIDTH, HEIGHT)).save(path)
+    return folder
+
+
+KINDS = [(f"{number}.png", kind) for number, kind in enumerate(PARAMETERS) if kind != "FULL_OPENCV"]
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_a_point_projects_where_colmap_projects_it(tmp_path, text):
+    model = model_of(KINDS)
+    capture = load_capture(_write(tmp_path / "c", model, text=text), downscale=1, normalize=False)
+    assert capture.names == tuple(f"images/{name}" for name, _ in KINDS)
+    points = np.random.default_rng(0).uniform(-0.7, 0.7, (40, 3))
+    for index, photo in enumerate(model.images[number] for number in sorted(model.images)):
+        expected = np.array([photo.project_point(point) for point in points])
+        pixels, depth, _ = capture.cameras.project(index, points)
+        np.testing.assert_allclose(pixels, expected, rtol=0, atol=1e-9)
+        assert (depth > 2).all()
+
+
+def test_poses_and_lenses_are_those_of_the_model(tmp_path):
+    model = model_of(KINDS)
+    cameras = load_capture(_write(tmp_path / "c", model), downscale=1, normalize=False).cameras
+    for index, number in enumerate(sorted(model.images)):
+        photo = model.images[number]
+        np.testing.assert_allclose(cameras.origins[index], photo.projection_center(), atol=1e-12)
+        np.testing.assert_allclose(-cameras.camera_to_world[index, :, 2], photo.viewing_direction(), atol=1e-12)
+    np.testing.assert_allclose(cameras.intrinsics[0], [60.001, 60.001, 31.001, 25.001])  # SIMPLE_PINHOLE
+    np.testing.assert_allclose(cameras.intrinsics[4], [60.005, 61.005, 31.005, 25.005])  # OPENCV
+    np.testing.assert_allclose(cameras.distortion[4], [0.055, -0.005, 0, 0, 0.007, 0.002], atol=1e-12)
+    np.testing.assert_allclose(cameras.distortion[2], [0.053, 0, 0, 0, 0, 0], atol=1e-12)
+
+
+def test_the_model_itself_and_photos_elsewhere_are_understood(tmp_path):
+    folder = _write(tmp_path / "c", model_of(KINDS))
+    whole = load_capture(folder)
+    assert load_capture(folder / "sparse" / "0").names == whole.names
+    moved = shutil.move(folder / "images", tmp_path / "photos")
+    with pytest.raises(FileNotFoundError, match="5 of the 5 photos that the COLMAP model 0 names are not in"):
+        load_capture(folder)
+    elsewhere = load_capture(folder, photos=moved)
+    assert elsewhere.names == tuple(name for name, _ in KINDS)
+    assert elsewhere.images([0]).shape == (1, 6, 8, 3)
+    np.testing.assert_array_equal(elsewhere.cameras.camera_to_world, whole.cameras.camera_to_world)
+    cameras = load_cameras(folder)
+    assert (len(cameras), cameras.width, cameras.height) == (5, WIDTH, HEIGHT)
+
+
+def test_photos_in_two_folders_are_two_sweeps(tmp_path):
+    names = [("walk/1.png", "PINHOLE"), ("back/1.png", "PINHOLE"), ("walk/2.png", "PINHOLE")]
+    capture = load_capture(_write(tmp_path / "c", model_of(names)))
+    assert {name: [capture.names[i] for i in found] for name, found in capture.splits.items()} == {
+        "back": ["images/back/1.png"],
+        "walk": ["images/walk/1.png", "images/walk/2.png"],
+    }
+
+
+def test_transforms_json_wins_over_a_model_beside_it(tmp_path):
+    folder = _write(tmp_path / "c", model_of(KINDS))
+    (folder / "transforms.json").write_text("{}")
+    with pytest.raises(ValueError, match=r"transforms\.json in .* has no frames"):
+        load_capture(folder)
+
+
+def test_of_parts_that_were_not_joined_the_largest_is_read_with_a_warning(tmp_path):
+    folder = _write(tmp_path / "c", model_of(KINDS[:2]))
+    _write(folder, model_of(KINDS[2:]), part="1")
+    with pytest.warns(UserWarning, match=r"did not join \(0: 2 photos, 1: 3 photos\)"):
+        capture = load_capture(folder)
+    assert capture.names == ("images/2.png", "images/3.png", "images/4.png")
+    assert find_model(tmp_path) is None
+
+
+def test_a_lens_that_opencv_cannot_say_is_refused(tmp_path):
+    folder = _write(tmp_path / "c", model_of([("a.png", "FULL_OPENCV")]))
+    with pytest.raises(
+        ValueError, match=r"camera 1 of .* is a FULL_OPENCV, none of SIMPLE_PINHOLE, .*image_undistorter"
+    ):
+        load_capture(folder)
+
+
+def _cut(name, count):
+    return lambda folder: (folder / name).write_bytes((folder / name).read_bytes()[:count])
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        _cut("images.bin", 100),
+        _cut("cameras.bin", 30),
+        lambda folder: (folder / "images.bin").write_bytes(b"\xff" * 500),
+        lambda folder: (folder / "cameras.bin").write_bytes(b"\xff" * 500),
+        lambda folder: (folder / "images.bin").write_bytes(b""),
+    ],
+)
+def test_broken_models_are_refused(tmp_path, spoil):
+    folder = _write(tmp_path / "c", model_of(KINDS))
+    spoil(folder / "sparse" / "0")
+    with pytest.raises(ValueError, match=r"read_model: .*0 (is no COLMAP model that can be read|has no photo)"):
+        load_capture(folder)
+
+
+def test_points_are_not_read(tmp_path):
+    """A file of points cut short takes pycolmap's reader, and the process, down."""
+    folder = _write(tmp_path / "c", model_of(KINDS))
+    (folder / "sparse" / "0" / "points3D.bin").write_bytes(b"\xff" * 11)
+    assert len(load_capture(folder)) == 5
+    (folder / "sparse" / "0" / "points3D.bin").unlink()
+    assert len(load_capture(folder)) == 5
+
+
+def test_what_is_no_model_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="not a COLMAP model"):
+        read_model(tmp_path)
+
+
+def test_pycolmaps_log_level_is_left_alone(tmp_path):
+    before = pycolmap.logging.minloglevel
+    load_capture(_write(tmp_path / "c", model_of(KINDS)))
+    assert pycolmap.logging.minloglevel == before
+
+
+def test_without_pycolmap_the_extra_is_named(tmp_path, monkeypatch):
+    folder = _write(tmp_path / "c", model_of(KINDS))
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    with pytest.raises(ImportError, match=r"pip install unghost\[capture\]"):
+        load_capture(folder)

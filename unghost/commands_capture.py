@@ -1,0 +1,173 @@
+"""The verbs that make a capture for the two-trajectory protocol, and hand one on to nerfstudio."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import Positional, arg
+
+TRAIN_NAMES, EVAL_NAMES = ("train",), ("eval", "test", "val")  # sweeps that are meant if none is named
+
+
+def capture(
+    train: Positional[Annotated[Path, arg(metavar="TRAIN")]],
+    evaluation: Positional[Annotated[Path, arg(metavar="EVALUATION")]],
+    out: Path, frames: int = 100, one_lens: bool = False,
+    longest_side: int = 1600, minimum_share: float = 0.5, seed: int = 0, threads: int = 0, plot: Path | None = None,
+) -> None:  # fmt: skip
+    """Make a capture from two videos (or two folders of photos): one to train on, one to be scored on.
+
+    The sharpest frames are kept, both sweeps are posed together by COLMAP (on the CPU; 2 x 100 frames take half an
+    hour or more on two cores), and the folder can be read by unghost and by stock nerfstudio.
+
+    Args:
+        train: video or folder of photos to train on.
+        evaluation: the same, of another walk through the same scene, to be scored on.
+        out: new folder: images, transforms.json (with nerfstudio's file lists), splits.json, capture.json, sparse/0.
+        frames: kept of each sweep at most: the sharpest of each of so many equal stretches.
+        one_lens: both were taken with one camera at one zoom; else each sweep has a lens of its own.
+        longest_side: features are looked for in photos shrunk to this many pixels. Smaller is faster.
+        minimum_share: of the frames of each sweep that must get a pose, or it is an error.
+        seed: of COLMAP's random choices.
+        threads: 0 for one per core; with 1, the same seed gives the same poses to the last bit.
+        plot: PNG for a bird's-eye view of both sweeps.
+    """
+    from tqdm import tqdm
+
+    from .evaluation.new_capture import make_capture
+    from .evaluation.posing import PosingSettings
+
+    settings = PosingSettings(
+        one_lens=one_lens, longest_side=longest_side, minimum_share=minimum_share, seed=seed, threads=threads
+    )
+    if plot is not None:
+        _check_plot(plot, "capture")
+    bars: dict[str, Any] = {}
+
+    def progress(stage: str, done: int, total: int) -> None:
+        if stage not in bars:
+            bars[stage] = tqdm(total=total, desc=stage, unit="pair" if stage == "pairs" else "photo")
+        bars[stage].update(done - bars[stage].n)
+        if done == total:
+            bars[stage].close()
+
+    try:
+        told = make_capture(train, evaluation, out, frames=frames, settings=settings, progress=progress)
+    finally:
+        for bar in bars.values():
+            bar.close()
+    for sweep in ("train", "eval"):
+        each = told[sweep]
+        print(f"{sweep}: {each['seen']} pictures in {each['source']}, {each['kept']} kept, {each['posed']} posed")
+    if told["unposed"]:
+        print(f"without a pose, and left out: {', '.join(told['unposed'])}")
+    print(f"reprojection error {told['reprojection_error']:.2f} pixels, {told['points']} points")
+    posed, _ = _read(out, None, "error", None)
+    _report(posed, *_sweeps(posed, None, None), plot)
+    print(f"{out}: ns-train nerfacto --data {out}")
+
+
+def convert(
+    capture: Positional[Annotated[Path, arg(metavar="CAPTURE")]],
+    out: Path | None = None, train_split: str | None = None, eval_split: str | None = None, every: int | None = None,
+    splits: Path | None = None, photos: Path | None = None, missing: Literal["error", "drop"] = "error",
+    link: bool = False, plot: Path | None = None,
+) -> None:  # fmt: skip
+    """Say how hard a capture's evaluation is and, with --out, write it as stock nerfstudio reads it.
+
+    Reads transforms.json folders (the released Nerfbusters captures with their frame_1_... names too) and COLMAP
+    models. Writes photos, poses, and the train, val and test lists that override nerfstudio's --eval-mode.
+
+    Args:
+        capture: folder with transforms.json, or with a COLMAP model in sparse/0 and photos in images.
+        out: new folder to write; without it, nothing is written but what --plot asks for.
+        train_split: the sweep to train on: "train" unless told otherwise; "all" is every photo.
+        eval_split: the sweep to be scored on: "eval", else "test" or "val", unless told otherwise.
+        every: in place of eval_split: hold out every so many-th photo of train_split (8 is what most papers do).
+        splits: JSON file of sweeps, {"name": ["images/a.jpg", ...], ...}, in place of what the capture says.
+        photos: folder that holds the photos, if they are not where the capture says.
+        missing: "drop" leaves photos out that are not there, and counts them.
+        link: symbolic links to the photos instead of copies.
+        plot: PNG for a bird's-eye view of both sweeps.
+    """
+    from .evaluation.difficulty import every_nth
+    from .evaluation.nerfstudio_folder import write_nerfstudio
+
+    if plot is not None:
+        _check_plot(plot, "convert")
+    if every is not None and eval_split is not None:
+        raise ValueError("convert: --every takes its photos from the training sweep: leave --eval-split out")
+    posed, told = _read(capture, splits, missing, photos)
+    print("\n".join(told), end="\n" if told else "")
+    if every is None:
+        train, evaluation = _sweeps(posed, train_split, eval_split)
+    else:
+        whole = posed.split(_chosen(posed, train_split, TRAIN_NAMES, "--train-split"))
+        taught, held_out = every_nth(len(whole), n=every)
+        train, evaluation = whole[taught], whole[held_out]
+    both = len({*train.tolist(), *evaluation.tolist()})
+    print(f"{len(train)} photos to train on, {len(evaluation)} to be scored on, {len(posed) - both} in neither")
+    if both < len(train) + len(evaluation):
+        print(f"{len(train) + len(evaluation) - both} photos are in both sweeps: they were trained on")
+    _report(posed, train, evaluation, plot, held_out=every)
+    if out is not None:
+        write_nerfstudio(posed, out, train=train, evaluation=evaluation, photos="link" if link else "copy")
+        print(f"{out}: ns-train nerfacto --data {out}")
+
+
+def _check_plot(path: Path, verb: str) -> None:
+    """Before minutes are spent: the picture can be drawn."""
+    import importlib.util
+
+    if path.suffix.lower() != ".png":
+        raise ValueError(f"{verb}: --plot must end in .png, got {path}")
+    if importlib.util.find_spec("matplotlib") is None:
+        raise ImportError(f"{verb}: --plot needs matplotlib: pip install unghost[capture]")
+
+
+def _read(folder: Path, splits: Path | None, missing: str, photos: Path | None) -> tuple[Any, list[str]]:
+    """The capture as it is stored, and what reading it gave to say."""
+    from .evaluation.captures import load_capture
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        posed = load_capture(folder, downscale=1, normalize=False, splits=splits, missing=missing, photos=photos)
+    return posed, [str(each.message) for each in caught]
+
+
+def _chosen(posed: Any, named: str | None, usual: tuple[str, ...], option: str) -> str:
+    """The sweep that is meant."""
+    if named is not None:
+        return named
+    found = next((name for name in usual if name in posed.splits), None)
+    if found is None:
+        known = ", ".join(posed.splits) or "none: --splits can name them, or --train-split all --every 8"
+        raise ValueError(f"{option} must say which sweep is meant; the capture has {known}")
+    return found
+
+
+def _sweeps(posed: Any, train: str | None, evaluation: str | None) -> tuple[Any, Any]:
+    return (
+        posed.split(_chosen(posed, train, TRAIN_NAMES, "--train-split")),
+        posed.split(_chosen(posed, evaluation, EVAL_NAMES, "--eval-split")),
+    )
+
+
+def _report(posed: Any, train: Any, evaluation: Any, plot: Path | None, *, held_out: int | None = None) -> None:
+    """Print the difficulty, and draw the sweeps if asked to; ``held_out``: the evaluation is every so many-th photo."""
+    from .evaluation.birds_eye import draw_birds_eye
+    from .evaluation.difficulty import difficulty_rows, difficulty_text
+
+    taught, scored = posed.cameras.select(train), posed.cameras.select(evaluation)
+    rows = difficulty_rows(taught, scored)
+    heading = "the other sweep" if held_out is None else f"every {held_out}th training photo"
+    if held_out is not None:
+        rows = [{**rows[0], "method": heading}]
+    print(difficulty_text(rows))
+    if plot is not None:
+        beside = 8 if held_out is None else None
+        title = posed.folder.resolve().name
+        draw_birds_eye(plot, taught, scored, title=title, heading=f"scored on {heading}", n=beside)
+        print(plot)
