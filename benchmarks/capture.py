@@ -15,7 +15,6 @@ import ast
 import copy
 import dataclasses
 import functools
-import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,7 @@ import numpy as np
 import tyro
 from fit_cache import FitCache, Plan, code_hash, file_hash, say, training_hooks
 from numpy.typing import NDArray
+from trajectory_scenes import Sweep
 
 import unghost.fields
 import unghost.regularizer
@@ -118,19 +118,6 @@ def _literal(text: str) -> Any:
         return ast.literal_eval(text)
     except (ValueError, SyntaxError):
         return text
-
-
-@dataclass(frozen=True)
-class Sweep:
-    """Cameras and photos ``(n, H, W, 3)``."""
-
-    cameras: Cameras
-    photos: NDArray[np.float32]
-
-    def digest(self) -> str:
-        """Of every pixel and every number of the cameras."""
-        arrays = (self.photos, self.cameras.camera_to_world, self.cameras.intrinsics, self.cameras.distortion)
-        return hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).hexdigest()
 
 
 def render(field: RadianceField, cameras: Cameras) -> Views:

@@ -30,6 +30,7 @@ from unghost.regularizer.strength import choose_strength
 PAPER_PRIOR = Path(__file__).parent / "weights" / "small-epsilon.onnx"
 PAPER_TIMESTEPS = (10, 50)
 UNCERTAINTY_THRESHOLDS = (0.9, 0.4, 0.5, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.95, 1.0)
+UNCERTAINTY_RAYS = 1 << 16
 STRENGTHS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7)
 
 
@@ -63,6 +64,7 @@ def _bayes_rays(job: Job) -> list[Outcome]:
     told = job.scene.train
     found = deformation_uncertainty(
         job.base, told.cameras, told.photos, seed=job.seed, sampling=job.scene.sampling, level=7,
+        rays=min(UNCERTAINTY_RAYS, told.photos[..., 0].size),
     )  # fmt: skip
     seconds = time.perf_counter() - begun
     return [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from unghost.core.occupancy import FREE_LABEL, SURFACE_LABEL, OccupancyRule, opa
 from unghost.data_recipes.harvest_labels import Truth as Labels
 from unghost.evaluation.captures import load_capture
 from unghost.evaluation.conventions import SceneExtent
+from unghost.evaluation.difficulty import every_nth
 from unghost.evaluation.protocol import ray_depth
 from unghost.evaluation.pseudo import PseudoTruth, make_pseudo_truth
 from unghost.evaluation.views import Truth
@@ -77,6 +79,14 @@ class TrajectoryScene:
         """Its lengths."""
         return SceneExtent.of(self.train.cameras, self.evaluation.cameras)
 
+    def every_nth(self, n: int = 8) -> TrajectoryScene:
+        """What most papers score: every n-th photo of the training sweep, which then does not train."""
+        taught, held_out = every_nth(len(self.train.photos), n=n)
+        parts = [Sweep(self.train.cameras.select(chosen), self.train.photos[chosen]) for chosen in (taught, held_out)]
+        first = self.photographed
+        known = [None, None] if first is None else [_selected(first, chosen) for chosen in (taught, held_out)]
+        return dataclasses.replace(self, train=parts[0], evaluation=parts[1], photographed=known[0], again=known[1])
+
     def pseudo(self, depth_of: DepthOf) -> PseudoTruth:
         """Maps of the evaluation views: exact where everything is known, else by ``depth_of`` (along unit rays)."""
         train, seen = self.train.cameras, self.evaluation.cameras
@@ -95,6 +105,15 @@ class TrajectoryScene:
     def truth(self, pseudo: PseudoTruth) -> Truth:
         """What is scored against: occlusion counts."""
         return pseudo.truth(self.evaluation.photos, occlusion=True)
+
+
+def _selected(photographed: PhotographedScene, chosen: NDArray[Any]) -> PhotographedScene:
+    """Some of the photos."""
+    return dataclasses.replace(
+        photographed, cameras=photographed.cameras.select(chosen),
+        true_cameras=photographed.true_cameras.select(chosen),
+        images=photographed.images[chosen], depth_maps=photographed.depth_maps[chosen],
+    )  # fmt: skip
 
 
 class LabelledSpace:

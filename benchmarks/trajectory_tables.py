@@ -108,7 +108,8 @@ def format_rows(rows: Sequence[dict[str, Any]], keys: Sequence[str]) -> str:
     return "\n".join(lines)
 
 
-def _main_rows(results: dict[str, Any], table: str) -> list[dict[str, Any]]:
+def main_rows(results: dict[str, Any], table: str) -> list[dict[str, Any]]:
+    """One row a method of a table, other settings of its knob left out."""
     return [row for row in results["rows"] if row["table"] == table and "@" not in row["method"]]
 
 
@@ -118,7 +119,7 @@ def write_figures(path: Path) -> None:
     from matplotlib.figure import Figure
 
     results = json.loads(path.read_text(encoding="utf-8"))
-    rows = _main_rows(results, "main")
+    rows = [row for row in main_rows(results, "main") if row["coverage"]]
     if not rows:
         return
     figure = Figure(figsize=(13, 5.4), facecolor="white", layout="constrained")

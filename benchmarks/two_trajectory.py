@@ -36,9 +36,10 @@ from trajectory_tables import summary_rows, write_figures
 from unghost.core.results import build_results, write_results
 from unghost.evaluation.conventions import evaluation_masks, get_convention
 from unghost.evaluation.curves import cut_to_coverage
+from unghost.evaluation.difficulty import difficulty_rows
 from unghost.evaluation.protocol import json_ready
 from unghost.evaluation.pseudo import PseudoTruth
-from unghost.evaluation.scoring import score_scene
+from unghost.evaluation.scoring import score_scene, score_under_all
 from unghost.evaluation.sparsification import sparsify
 from unghost.evaluation.views import Renders, Truth
 from unghost.fields.radiance import RadianceConfig, RadianceField
@@ -70,6 +71,7 @@ class Options:
         capture_steps: the same two for the capture.
         equal_seconds: a second table, every training method for as many seconds as ``visibility`` takes.
         ablation: the paper's ablation instead of the main table.
+        every_eighth: score every 8th photo of the training sweep instead of the other sweep, to see what that hides.
         short: two scenes, one seed, a third of the steps.
         threads: of torch and onnxruntime.
         out: where two_trajectory.json and the figures go.
@@ -89,6 +91,7 @@ class Options:
     capture_steps: tuple[int, int] = (360, 100)
     equal_seconds: bool = False
     ablation: bool = False
+    every_eighth: bool = False
     short: bool = False
     threads: int = 2
     out: Path = ROOT / "docs" / "results"
@@ -102,7 +105,22 @@ class Options:
 
     def table(self) -> str:
         """Which of the tables the rows belong to."""
-        return "ablation" if self.ablation else "equal seconds" if self.equal_seconds else "main"
+        chosen = {"ablation": self.ablation, "equal seconds": self.equal_seconds, "every 8th photo": self.every_eighth}
+        named = [name for name, wanted in chosen.items() if wanted]
+        if len(named) > 1:
+            raise ValueError(f"two_trajectory: one table at a time, got {' and '.join(named)}")
+        return named[0] if named else "main"
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """One scene with the truth about it."""
+
+    scene: TrajectoryScene
+    pseudo: PseudoTruth
+    truth: Truth
+    fit_steps: int
+    steps: int
 
 
 class Ledger:
@@ -113,6 +131,7 @@ class Ledger:
         self.path = options.out / "two_trajectory.json"
         stored = json.loads(self.path.read_text(encoding="utf-8")) if self.path.exists() else {}
         self.cells: list[dict[str, Any]] = stored.get("cells", [])
+        self.scenes: dict[str, dict[str, Any]] = stored.get("scenes", {})
 
     def key(self, scene: str, seed: int, method: str, steps: int) -> dict[str, Any]:
         """What a row is known by."""
@@ -129,6 +148,13 @@ class Ledger:
                 return float(cell["seconds"])
         raise ValueError(f"two_trajectory: equal seconds are those of {method}: do the main table of {scene} first")
 
+    def describe(self, stage: Stage) -> None:
+        """How hard a scene is, and how much of its evaluation views was seen."""
+        hard, *_ = difficulty_rows(stage.scene.train.cameras, stage.scene.evaluation.cameras)
+        hard |= {"visible": float(stage.pseudo.visible(occlusion=True).mean()), "depth_limit": stage.scene.extent.limit}
+        self.scenes.setdefault(self.options.table(), {})[stage.scene.name] = hard
+        self.add([])
+
     def add(self, rows: list[dict[str, Any]]) -> None:
         """Keep rows, and write the file with all means anew."""
         self.cells += [json_ready(row) for row in rows]
@@ -138,20 +164,9 @@ class Ledger:
         seeds = sorted({cell["seed"] for cell in self.cells})
         results = build_results(
             summary_rows(self.cells), command=command, seeds=seeds, convention=CONVENTION,
-            scene_seed=self.options.scene_seed, threads=self.options.threads, cells=self.cells,
+            scene_seed=self.options.scene_seed, threads=self.options.threads, scenes=self.scenes, cells=self.cells,
         )  # fmt: skip
         write_results(self.path, json_ready(results))
-
-
-@dataclass(frozen=True, eq=False)
-class Stage:
-    """One scene with the truth about it."""
-
-    scene: TrajectoryScene
-    pseudo: PseudoTruth
-    truth: Truth
-    fit_steps: int
-    steps: int
 
 
 def fitted(options: Options, cache: FitCache, stage_name: str, scene: TrajectoryScene, sweep: Sweep, seed: int,
@@ -172,6 +187,7 @@ def stages(options: Options, cache: FitCache) -> Iterator[Stage]:
     """The scenes, one after the other; a capture's truth is that of a field trained on both sweeps."""
     for name in options.scenes:
         scene = synthetic_scene(options.scene_seed, name)
+        scene = scene.every_nth() if options.every_eighth else scene
         pseudo = scene.pseudo(lambda cameras: np.zeros(0))
         yield Stage(scene, pseudo, scene.truth(pseudo), options.fit_steps, options.steps)
     if options.capture is not None:
@@ -182,12 +198,13 @@ def stages(options: Options, cache: FitCache) -> Iterator[Stage]:
         def depth_of(cameras: Any) -> NDArray[Any]:
             return np.stack([render_view(field, cameras, index)["depth"] for index in range(len(cameras))])
 
+        scene = scene.every_nth() if options.every_eighth else scene
         pseudo = scene.pseudo(depth_of)
         yield Stage(scene, pseudo, scene.truth(pseudo), fit_steps, steps)
 
 
-def scored(stage: Stage, outcome: Outcome, space: LabelledSpace | None) -> dict[str, Any]:
-    """All that a row says of one setting of a method."""
+def scored(stage: Stage, outcome: Outcome, space: LabelledSpace | None, *, conventions: bool = False) -> dict[str, Any]:
+    """All that a row says of one setting of a method; with ``conventions``, its scores under every published one too."""
     views = render(outcome, stage.scene, stage.scene.evaluation.cameras)
     renders = Renders(np.clip(views["rgb"], 0, 1), views["depth"], np.clip(views["accumulation"], 0, 1))
     extent = stage.scene.extent
@@ -201,6 +218,9 @@ def scored(stage: Stage, outcome: Outcome, space: LabelledSpace | None) -> dict[
             curve.append({"coverage": coverage, **{key: point.means()[key] for key in CURVE_KEYS}})
     row = {"convention": CONVENTION, **means, "psnr_visible": _psnr_visible(renders, stage.truth), "curve": curve}
     row["ause"] = _ause(views, stage, mask)
+    if conventions:
+        under = score_under_all(renders, stage.truth, extent)
+        row["conventions"] = {name: each.means() for name, each in under.items() if each.images}
     if space is not None:
         row |= space.scores(outcome.field)
     return {**row, "seconds": outcome.seconds, "trained_steps": outcome.steps, "knob": outcome.knob,
@@ -230,13 +250,15 @@ def rows_of(key: dict[str, Any], stage: Stage, outcomes: list[Outcome], space: L
     rows = []
     for number, outcome in enumerate(outcomes):
         name = key["method"] if number == 0 else f"{key['method']} @ {outcome.knob:g}"
-        rows.append({**key, "method": name, **scored(stage, outcome, space)})
+        found = scored(stage, outcome, space, conventions=name == "field")
+        rows.append({**key, "method": name, **found})
     return rows
 
 
 def run_stage(options: Options, stage: Stage, cache: FitCache, ledger: Ledger, plan: Plan) -> None:
     """All seeds and methods of one scene."""
     scene = stage.scene
+    ledger.describe(stage)
     table: dict[str, Callable[[Job], list[Outcome]]] = ABLATION if options.ablation else METHODS
     names = tuple(ABLATION) if options.ablation else options.methods
     for seed in options.seeds:

@@ -11,7 +11,7 @@ pytest.importorskip("torch")
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 PARTS = ("fit_cache", "trajectory_scenes", "trajectory_job", "trajectory_rivals", "trajectory_methods",
-         "trajectory_ablation", "trajectory_tables", "two_trajectory")  # fmt: skip
+         "trajectory_ablation", "trajectory_tables", "trajectory_page", "two_trajectory")  # fmt: skip
 
 
 @pytest.fixture
@@ -60,9 +60,11 @@ def stage(bench, monkeypatch):
     scenes, main = bench["trajectory_scenes"], bench["two_trajectory"]
     monkeypatch.setattr(scenes, "POINTS", 4000)
     monkeypatch.setattr(scenes, "FEWEST_SEEN", 0.0)
+    # a field that has hardly been trained puts everything far away
+    monkeypatch.setattr(scenes.TrajectoryScene, "extent", scenes.SceneExtent(limit=60.0, unit=1.0))
     scene = scenes.synthetic_scene(2026, "room-1", photos=4, views=2, width=24, resolution=24)
     pseudo = scene.pseudo(lambda cameras: np.zeros(0))
-    return main.Stage(scene, pseudo, scene.truth(pseudo), 8, 2)
+    return main.Stage(scene, pseudo, scene.truth(pseudo), 20, 2)
 
 
 @pytest.mark.slow
@@ -89,8 +91,14 @@ def test_every_method_runs_and_a_run_goes_on_where_it_was_broken_off(bench, stag
     stored = json.loads((tmp_path / "two_trajectory.json").read_text())
     assert {row["method"] for row in stored["rows"]} == set(done)
     assert "NaN" not in (tmp_path / "two_trajectory.json").read_text()
-    main.write_figures(ledger.path)
+    assert done["field"]["coverage"] > 0.1
+    monkeypatch.setattr(bench["trajectory_page"].sys, "argv", ["", str(ledger.path)])
+    bench["trajectory_page"].main()
     assert (tmp_path / "two_trajectory.png").stat().st_size > 10_000
+    text = (tmp_path / "README.md").read_text()
+    assert "we win" in text or "we lose" in text
+    assert "| room-1 | 4 | 2 |" in text  # the scene and its photos
+    assert all(f"| {method} |" in text for method in options.methods)
 
     again = main.Ledger(options)
     monkeypatch.setattr(main, "fitted", lambda *ignored: pytest.fail("a finished row was done again"))
