@@ -204,7 +204,7 @@ def stages(options: Options, cache: FitCache) -> Iterator[Stage]:
 
 
 def scored(stage: Stage, outcome: Outcome, space: LabelledSpace | None, *, conventions: bool = False) -> dict[str, Any]:
-    """All that a row says of one setting of a method; with ``conventions``, its scores under every published one too."""
+    """All that a row says of one setting of a method; ``conventions``: under every published one, too."""
     views = render(outcome, stage.scene, stage.scene.evaluation.cameras)
     renders = Renders(np.clip(views["rgb"], 0, 1), views["depth"], np.clip(views["accumulation"], 0, 1))
     extent = stage.scene.extent
