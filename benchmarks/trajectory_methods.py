@@ -29,9 +29,9 @@ from unghost.regularizer.strength import choose_strength
 
 PAPER_PRIOR = Path(__file__).parent / "weights" / "small-epsilon.onnx"
 PAPER_TIMESTEPS = (10, 50)
-UNCERTAINTY_THRESHOLDS = (0.9, 0.4, 0.5, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.95, 1.0)
+UNCERTAINTY_THRESHOLDS = (0.9, 0.4, 0.5, 0.6, 0.7, 0.8, 0.95, 1.0)
 UNCERTAINTY_RAYS = 1 << 16
-STRENGTHS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7)
+STRENGTHS = (0.1, 0.3, 0.5, 0.7)
 
 
 def _with(*makers: Callable[[Job], Term]) -> Callable[[Job], list[Outcome]]:
@@ -107,10 +107,12 @@ def cleaned(job: Job, base: Any, *, model: str = "default") -> list[Outcome]:
         return float(np.mean((np.stack(seen) - told.photos[list(asked)]) ** 2))
 
     choice = choose_strength(judgement, error, strengths=(0.0, *STRENGTHS))
+    doubted: dict[str, Any] = {"uncertainty": judgement.doubt, "background_uncertainty": 0.5}
     chosen = Outcome(FilteredField(base, choice.mask.keep), time.perf_counter() - begun,
-                     details={"strength": choice.strength})  # fmt: skip
+                     details={"strength": choice.strength}, **doubted)  # fmt: skip
     others = [
-        Outcome(FilteredField(base, judgement.mask(strength).keep), judged, knob=strength) for strength in STRENGTHS
+        Outcome(FilteredField(base, judgement.mask(strength).keep), judged, knob=strength, **doubted)
+        for strength in (0.0, *STRENGTHS)
     ]
     return [chosen, *others]
 

@@ -11,21 +11,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from trajectory_tables import KEYS, format_rows, main_rows, summary_rows, write_figures
+from trajectory_tables import KEYS, REFERENCE, format_rows, main_rows, summary_rows, write_figures
 
 from unghost.evaluation.conventions import get_convention
 from unghost.evaluation.report import convention_rows
 
 ROOT = Path(__file__).resolve().parents[1]
 OURS = ("dsds-restoration", "clean", "visibility+clean")
+WATCHED = (*OURS, "bayes-rays", "visibility", "field")
 PLAIN = {
-    "psnr_at_coverage": ("masked PSNR", "dB", 1, 2),
-    "ssim_at_coverage": ("masked SSIM", "", 1, 3),
-    "disparity_mae_at_coverage": ("disparity error", "", -1, 3),
-    "normal_mean_deg_at_coverage": ("angle of normals", "°", -1, 1),
+    "psnr_at_coverage": ("masked PSNR at equal coverage", "dB", 1, 2),
+    "ssim_at_coverage": ("masked SSIM at equal coverage", "", 1, 3),
+    "disparity_mae_at_coverage": ("disparity error at equal coverage", "", -1, 3),
+    "normal_mean_deg_at_coverage": ("angle of normals at equal coverage", "°", -1, 1),
     "free_space_error": ("opacity left in free space", "", -1, 4),
-    "floater_recall": ("labelled floaters removed", "", 1, 3),
-    "surface_kept": ("labelled surface kept", "", 1, 3),
     "coverage": ("coverage", "", 1, 3),
 }
 OTHER_TABLES = {
@@ -37,28 +36,30 @@ Row = dict[str, Any]
 
 
 def who_wins(rows: list[Row]) -> list[str]:
-    """A line a score: the best, ours, and the best of the others."""
-    methods = [row for row in rows if row["method"] not in ("pseudo-gt", "field")]
+    """A line a score: who is best, and which place ours, Bayes' Rays and the field alone have."""
+    most = max(row["runs"] for row in rows)
+    methods = [row for row in rows if row["method"] != REFERENCE and row["runs"] == most]
     lines = []
     for key, (name, unit, sign, digits) in PLAIN.items():
-        known = [row for row in methods if row.get(key) is not None]
-        mine = [row for row in known if row["method"] in OURS]
-        if not known or not mine:
+        known = sorted((row for row in methods if row.get(key) is not None), key=lambda row: -sign * row[key])
+        if not known:
             continue
-
-        def said(row: Row, key: str = key, unit: str = unit, digits: int = digits) -> str:
-            return f"`{row['method']}` {row[key]:.{digits}f}{' ' if unit == 'dB' else ''}{unit}"
-
-        best = max(known, key=lambda row: sign * row[key])
-        us = max(mine, key=lambda row: sign * row[key])
-        others = [row for row in known if row["method"] not in OURS]
-        rival = max(others, key=lambda row: sign * row[key]) if others else None
-        won = best["method"] in OURS
-        text = f"- **{name[0].upper()}{name[1:]}: {'we win' if won else 'we lose'}.** Best {said(best)}"
-        text += f"; the best rival {said(rival)}" if won and rival else ("" if won else f"; ours {said(us)}")
-        field = next((row for row in rows if row["method"] == "field"), None)
-        text += f"; the field alone {said(field)}" if field and field.get(key) is not None else ""
-        lines.append(text + ".")
+        values = {row["method"]: f"{row[key]:.{digits}f}{' dB' if unit == 'dB' else unit}" for row in known}
+        places = {row["method"]: 1 + sum(sign * other[key] > sign * row[key] for other in known) for row in known}
+        said = [f"`{method}` {values[method]} (place {places[method]} of {len(known)})"
+                for method in WATCHED if method in values and places[method] > 1]  # fmt: skip
+        best = [method for method, place in places.items() if place == 1]
+        verdict = "we win" if any(method in OURS for method in best) else "we lose"
+        lines.append(
+            f"- **{name[0].upper()}{name[1:]}: {verdict}.** Best: {' and '.join(f'`{each}`' for each in best)} "
+            f"{values[best[0]]}. {', '.join(said)}."
+        )
+    for row in rows:
+        if row["method"] == "clean" and row["strength"] is not None:
+            lines.append(
+                f"- `clean` chose its strength on the training photos: {row['strength']:.2f} in the mean, where 0 "
+                "leaves the field as it is and .5 is the prior's own threshold."
+            )
     return lines
 
 
@@ -77,8 +78,10 @@ def page(results: dict[str, Any]) -> str:
         "convention is `proper` ([what that is](../evaluation.md)); means are over scenes, in brackets elsewhere the "
         "95 % interval of a bootstrap over scenes.", "",
         "**Equal coverage.** Whoever removes more is scored on easier pixels. So every method is cut to the lowest "
-        "coverage among all of them on that scene, giving up the pixels whose depth along the ray is least sharp; "
-        "a method with a knob has it turned to its best there (in its favour, and with an eye on the truth).", "",
+        "coverage among all of them on that scene. It gives up the pixels whose depth along the ray is least sharp, "
+        "or, if it has an uncertainty of its own (`bayes-rays`; `clean`, whose prior doubts what is there), those of "
+        "which it is least sure, whichever is better for it; a knob is turned to its best there (in the method's "
+        "favour, and with an eye on the truth).", "",
         "## In plain words", "", *who_wins(rows), "", *scene_lines(results), "",
         "## At equal coverage", "",
         format_rows(rows, ("at_coverage", "psnr_at_coverage", "ssim_at_coverage", "disparity_mae_at_coverage",

@@ -18,17 +18,30 @@ from unghost.evaluation.intervals import bootstrap_scenes
 
 KEYS = (
     "psnr", "ssim", "flip", "depth_mse", "disparity_mae", "normal_mean_deg", "normal_median_deg", "normal_pct_30",
-    "coverage", "psnr_visible", "ause", "floater_recall", "surface_kept", "holes_filled", "free_space_error", "seconds",
+    "coverage", "psnr_visible", "ause", "floater_recall", "surface_kept", "holes_filled", "free_space_error",
+    "strength", "seconds",
 )  # fmt: skip
 AT_EQUAL = ("psnr", "ssim", "disparity_mae", "normal_mean_deg")
 LOWER_IS_BETTER = ("disparity_mae", "normal_mean_deg")
 FIXED = (0.3, 0.4, 0.5)
 REFERENCE = "pseudo-gt"
+FEWER_SEEDS = (REFERENCE, "dsds-paper")
+COLORS = {
+    "pseudo-gt": "#bbbbbb", "field": "#444444", "visibility": "#1f77b4", "visibility+sparsity": "#9ecae1",
+    "visibility+tv": "#17becf", "visibility+regnerf": "#74c476", "visibility+distortion": "#9467bd",
+    "free-space": "#e7ba52", "bayes-rays": "#2ca02c", "components": "#8c564b", "dsds-paper": "#f7b6d2",
+    "dsds-restoration": "#d62728", "clean": "#ff7f0e", "visibility+clean": "#ffbb78",
+}  # fmt: skip
+STRONG = ("field", "visibility", "visibility+distortion", "bayes-rays", "dsds-restoration", "clean")
 Cell = dict[str, Any]
 
 
 def summary_rows(cells: Sequence[Cell]) -> list[dict[str, Any]]:
-    """A row a table and method: means over scenes and seeds, intervals over scenes, scores at equal coverage."""
+    """A row a table and method: means over scenes and seeds, intervals over scenes, scores at equal coverage.
+
+    Runs in which a method is still missing are left out: means over different scenes do not compare.
+    """
+    cells = finished(cells)
     equal = _at_equal_coverage(cells)
     rows = []
     for table, method in dict.fromkeys((cell["table"], cell["method"]) for cell in cells):
@@ -50,6 +63,17 @@ def summary_rows(cells: Sequence[Cell]) -> list[dict[str, Any]]:
     return rows
 
 
+def finished(cells: Sequence[Cell]) -> list[Cell]:
+    """Cells of runs that have every method of their table, those aside that may have fewer seeds."""
+    wanted: dict[str, set[str]] = {}
+    found: dict[tuple[Any, ...], set[str]] = {}
+    for cell in cells:
+        if cell["method"] not in FEWER_SEEDS:
+            wanted.setdefault(cell["table"], set()).add(cell["method"])
+            found.setdefault(_run(cell), set()).add(cell["method"])
+    return [cell for cell in cells if wanted.get(cell["table"], set()) <= found.get(_run(cell), set())]
+
+
 def _run(cell: Cell) -> tuple[Any, ...]:
     return cell["table"], cell["scene"], cell["seed"]
 
@@ -63,19 +87,22 @@ def _mean(cells: Sequence[Cell], values: Sequence[float | None]) -> tuple[float 
     return found.mean, [found.low, found.high]
 
 
-def _curve(cell: Cell, key: str) -> Curve | None:
-    points = [point for point in cell["curve"] if point.get(key) is not None and point.get("coverage") is not None]
-    if not points:
-        return None
-    rows = [{**point, "convention": cell["convention"]} for point in points]
-    return Curve.create(cell["method"], rows, metric=key, higher_is_better=key not in LOWER_IS_BETTER)
+def _curves(cell: Cell, key: str) -> list[Curve]:
+    """Cut by the sharpness of each pixel's depth and, where the method has one, by its own uncertainty."""
+    curves = []
+    for name in ("curve", "curve_own"):
+        points = [each for each in cell.get(name, []) if each.get(key) is not None and each.get("coverage") is not None]
+        if points:
+            rows = [{**point, "convention": cell["convention"]} for point in points]
+            curves.append(Curve.create(cell["method"], rows, metric=key, higher_is_better=key not in LOWER_IS_BETTER))
+    return curves
 
 
 def _best(cells: Sequence[Cell], cell: Cell, key: str, coverage: float) -> float | None:
-    """A method's score at a coverage on one run, its knob turned to its best."""
+    """A method's score at a coverage on one run, its knob and its way to give up pixels turned to their best."""
     same = [other for other in cells if _run(other) == _run(cell)
             and (other is cell or other["method"].startswith(f"{cell['method']} @ "))]  # fmt: skip
-    curves = [curve for curve in (_curve(each, key) for each in same) if curve is not None]
+    curves = [curve for each in same for curve in _curves(each, key)]
     found = [value for value in (curve.at(coverage) for curve in curves) if value is not None]
     return (min if key in LOWER_IS_BETTER else max)(found, default=None)
 
@@ -127,20 +154,23 @@ def write_figures(path: Path) -> None:
     for axes, key, label in zip(
         figure.subplots(1, 2), ("psnr", "disparity_mae"), ("PSNR, dB (higher is better)", "disparity error (lower)")
     ):
-        for number, row in enumerate(rows):
-            style = {"color": f"C{number % 10}", "linestyle": ("-", "--")[number // 10 % 2]}
-            strong = row["method"] in ("bayes-rays", "dsds-restoration", "clean", "field", "visibility")
+        for row in rows:
+            strong, color = row["method"] in STRONG, COLORS.get(row["method"], "#888888")
             points = mean_curve(results["cells"], row["method"], key)
             if points:
-                axes.plot(*zip(*points), linewidth=2.2 if strong else 1.0, label=row["method"], **style)
+                axes.plot(*zip(*points), linewidth=2.4 if strong else 1.1, label=row["method"], color=color)
             if row["coverage"] and row[key]:
-                axes.plot(row["coverage"], row[key], "o", color=style["color"], markersize=7 if strong else 4)
+                axes.plot(row["coverage"], row[key], "o", color=color, markersize=7 if strong else 4)
+        shown = [line for line in axes.lines if line.get_color() != COLORS[REFERENCE]]
+        values = np.concatenate([np.asarray(line.get_ydata(), dtype=float) for line in shown]) if shown else [0.0, 1.0]
+        margin = 0.08 * (np.max(values) - np.min(values)) + 1e-6
+        axes.set_ylim(np.min(values) - margin, np.max(values) + margin)  # the reference may lie beyond
         axes.set_xlabel("coverage: share of all pixels that are scored")
         axes.set_ylabel(label)
         axes.grid(alpha=0.25)
         axes.spines[["top", "right"]].set_visible(False)
     figure.axes[0].legend(fontsize=8, frameon=False, ncols=2)
-    scenes, runs = sorted({cell["scene"] for cell in results["cells"]}), max(row["runs"] for row in rows)
+    scenes, runs = sorted({name for row in rows for name in row["scenes"]}), max(row["runs"] for row in rows)
     figure.suptitle(
         f"Score over coverage, mean of {len(scenes)} scenes ({runs} runs a method at most); dots: uncut", fontsize=12
     )
@@ -149,7 +179,8 @@ def write_figures(path: Path) -> None:
 
 def mean_curve(cells: Sequence[Cell], method: str, key: str) -> list[tuple[float, float]]:
     """(coverage, mean) at coverages that every run of a method reaches."""
-    mine = [cell for cell in cells if cell["table"] == "main" and cell["method"] == method]
+    cells = [cell for cell in finished(cells) if cell["table"] == "main"]
+    mine = [cell for cell in cells if cell["method"] == method]
     found = []
     for coverage in np.round(np.arange(0.1, 1.0, 0.05), 2):
         values = [_best(cells, cell, key, float(coverage)) for cell in mine]

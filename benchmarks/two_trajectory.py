@@ -6,10 +6,11 @@
 
 A field is fitted to one sweep of photos, every method improves it (``trajectory_methods.py``) for the same steps, and
 each is scored on another sweep under the convention ``proper``, at its own coverage and cut to others: it gives up the
-pixels whose depth is least sharp, and a method with a knob has it turned to its best at every coverage. Every finished
-row is saved at once in ``docs/results/two_trajectory.json``; what is there is not done again, so that a run that was
-broken off goes on with the same command. ``--equal-seconds`` trains for as long as ``visibility`` took, ``--ablation``
-does the paper's ablation. Tables and figures: ``trajectory_tables.py``.
+pixels whose depth is least sharp, or of which it is least sure by its own account, whichever is better for it, and has
+its knob, if any, turned to its best at every coverage. Every finished row is saved at once in
+``docs/results/two_trajectory.json``; what is there is not done again, so that a run that was broken off goes on with
+the same command. ``--equal-seconds`` trains for as long as ``visibility`` took, ``--ablation`` does the paper's
+ablation, ``--every-eighth`` scores every 8th photo of the first sweep. The page: ``trajectory_page.py``.
 """
 
 from __future__ import annotations
@@ -210,13 +211,21 @@ def scored(stage: Stage, outcome: Outcome, space: LabelledSpace | None, *, conve
     extent = stage.scene.extent
     means = score_scene(renders, stage.truth, extent, convention=CONVENTION).means()
     mask = evaluation_masks(get_convention(CONVENTION), renders, stage.truth, extent)
-    curve = [{"coverage": means["coverage"], **{key: means[key] for key in CURVE_KEYS}}]
-    for coverage in COVERAGES:
-        if coverage < means["coverage"]:
-            cut = cut_to_coverage(mask, -views["spread"], coverage=coverage)
+    whole = {"coverage": means["coverage"], **{key: means[key] for key in CURVE_KEYS}}
+
+    def curve(uncertainty: NDArray[Any]) -> list[dict[str, Any]]:
+        """Scores of the surest pixels, as many as each coverage asks for."""
+        points = [whole]
+        for coverage in (each for each in COVERAGES if each < means["coverage"]):
+            cut = cut_to_coverage(mask, -uncertainty, coverage=coverage)
             point = score_scene(renders, stage.truth, extent, convention=CONVENTION, within=cut, keys=CURVE_KEYS)
-            curve.append({"coverage": coverage, **{key: point.means()[key] for key in CURVE_KEYS}})
-    row = {"convention": CONVENTION, **means, "psnr_visible": _psnr_visible(renders, stage.truth), "curve": curve}
+            points.append({"coverage": coverage, **{key: point.means()[key] for key in CURVE_KEYS}})
+        return points
+
+    row = {"convention": CONVENTION, **means, "psnr_visible": _psnr_visible(renders, stage.truth)}
+    row["curve"] = curve(views["spread"])
+    if outcome.uncertainty is not None:
+        row["curve_own"] = curve(views["uncertainty"])
     row["ause"] = _ause(views, stage, mask)
     if conventions:
         under = score_under_all(renders, stage.truth, extent)

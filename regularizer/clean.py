@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..core.aabb import as_aabb, scene_extent
+from ..core.arrays import is_tensor, to_numpy
 from ..core.cameras import Cameras, warn_if_turned_away
 from ..core.manifest import Denoiser
 from ..core.occupancy import OccupancyRule
@@ -20,7 +21,7 @@ from ..core.transmittance import TransmittanceMaps
 from .context import GridContext, light_maps
 from .decide import decide, removed_regions
 from .denoise import check_denoiser
-from .keep_mask import KeepMask, lattice_origin
+from .keep_mask import KeepMask, lattice_origin, look_up_cells
 from .queries import CHUNK, Backend, make_query
 from .survey import Survey, survey_field
 from .windows import Progress, grow, shrink, vote
@@ -171,6 +172,21 @@ class Judgement:
     advised: float
     _survey: Survey
     _about: dict[str, Any]
+
+    def doubt(self, positions: Any) -> Any:
+        """How much the denoiser doubts what is at ``positions (..., 3)``: ``(...)`` float32 in [0, 1].
+
+        Arrays or tensors, as the positions are. 0 where it is sure of matter, 1 where it is sure of air, .5 where it
+        was not asked or outside the box. Averaged along a ray by rendering weights (light that gets through counting
+        .5), it tells which depths not to trust.
+        """
+        points = to_numpy(positions.detach().float() if is_tensor(positions) else positions).astype(np.float64)
+        values = look_up_cells((1.0 - self.score) / 2.0, points, aabb=self.aabb, pitch=self.pitch, outside=0.5)
+        if is_tensor(positions):
+            import torch
+
+            return torch.as_tensor(values.astype(np.float32), device=positions.device)
+        return values.astype(np.float32)
 
     def mask(self, strength: float | None = None) -> KeepMask:
         """The mask at a strength in [0, 1]; None for that of the settings."""

@@ -72,11 +72,7 @@ class KeepMask:
     def _keep(self, positions: NDArray[np.float64]) -> NDArray[np.bool_]:
         if positions.shape[-1:] != (3,):
             raise ValueError(f"KeepMask.keep: positions must have shape (..., 3), got {positions.shape}")
-        inside = ((positions >= self.aabb[0]) & (positions <= self.aabb[1])).all(axis=-1)
-        local = np.where(inside[..., None], positions - self.origin, 0.0)
-        index = np.clip(np.floor(local / self.pitch).astype(np.int64), 0, np.array(self.cells.shape) - 1)
-        kept: NDArray[np.bool_] = self.cells[tuple(np.moveaxis(index, -1, 0))] | ~inside
-        return kept
+        return look_up_cells(self.cells, positions, aabb=self.aabb, pitch=self.pitch, outside=True)
 
     def apply(self, density_fn: Callable[[Any], Any]) -> Callable[[Any], Any]:
         """The cleaned field: ``density_fn`` with its density set to 0 in cells that are not kept.
@@ -193,6 +189,17 @@ def lattice_origin(aabb: NDArray[np.float64], pitch: float, shape: tuple[int, ..
     """Lowest corner ``(3,)`` of ``shape`` cells of side ``pitch`` centred on the box."""
     middle: NDArray[np.float64] = (aabb[0] + aabb[1]) / 2 - np.array(shape) * pitch / 2
     return middle
+
+
+def look_up_cells(
+    cells: NDArray[Any], positions: NDArray[np.float64], *, aabb: NDArray[np.float64], pitch: float, outside: Any
+) -> NDArray[Any]:
+    """The value of the cell that holds each of ``positions (..., 3)``; ``outside`` where none does, or not finite."""
+    inside = ((positions >= aabb[0]) & (positions <= aabb[1])).all(axis=-1)
+    local = np.where(inside[..., None], positions - lattice_origin(aabb, pitch, cells.shape), 0.0)
+    index = np.clip(np.floor(local / pitch).astype(np.int64), 0, np.array(cells.shape) - 1)
+    values: NDArray[Any] = np.where(inside, cells[tuple(np.moveaxis(index, -1, 0))], outside)
+    return values
 
 
 def lattice_axes(aabb: NDArray[np.float64], pitch: float, shape: tuple[int, ...]) -> list[NDArray[np.float64]]:

@@ -30,10 +30,12 @@ def cell(method, scene, coverage, curve, **values):
 
 def test_scores_at_equal_coverage_by_hand(bench):
     cells = [
+        cell("field", "c", 0.8, [(0.8, 99.0)], psnr=99.0),  # not finished: bold is missing
         cell("pseudo-gt", "a", 0.1, [(0.1, 40.0)], psnr=40.0),  # the reference does not lower the bar
         cell("field", "a", 0.8, [(0.8, 18.0), (0.6, 20.0), (0.4, 21.0)], psnr=18.0),
         cell("bold", "a", 0.5, [(0.5, 19.0), (0.4, 22.0)], psnr=19.0),
         cell("bold @ 0.9", "a", 0.2, [(0.2, 30.0)], psnr=30.0),  # another setting of a knob does not either
+        cell("bold @ 0.9", "b", 0.2, [(0.2, 30.0)], psnr=30.0),
         cell("field", "b", 0.7, [(0.7, 10.0), (0.3, 14.0)], psnr=10.0),
         cell("bold", "b", 0.3, [(0.3, 13.0)], psnr=None),
     ]
@@ -49,7 +51,8 @@ def test_scores_at_equal_coverage_by_hand(bench):
     assert rows["field"]["ssim_at_coverage"] is None
     json.dumps(list(rows.values()), allow_nan=False)
     turned = cell("bold @ 0.5", "a", 0.6, [(0.6, 25.0), (0.4, 27.0)], psnr=25.0)
-    rows = {row["method"]: row for row in bench["trajectory_tables"].summary_rows([*cells, turned])}
+    other = cell("bold @ 0.5", "b", 0.2, [(0.2, 1.0)], psnr=1.0)
+    rows = {row["method"]: row for row in bench["trajectory_tables"].summary_rows([*cells, turned, other])}
     assert rows["bold"]["psnr_at_coverage"] == pytest.approx((26.0 + 13.0) / 2)  # at its best setting
     assert rows["field"]["psnr_at_coverage"] == pytest.approx((20.5 + 14.0) / 2)
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 
 from unghost.regularizer.clean import clean, judge
 from unghost.regularizer.strength import choose_strength
@@ -81,3 +82,21 @@ def test_a_tolerance_trades_error_for_strength(judgement):
 def test_what_is_refused(judgement, options, message):
     with pytest.raises(ValueError, match=message):
         choose_strength(judgement, **{"error": lambda mask: 0.0, **options})
+
+
+def test_doubt_is_what_the_denoiser_thinks_of_a_place(judgement):
+    corner, pitch = (BOX[0] + BOX[1]) / 2 - np.array(judgement.score.shape) * judgement.pitch / 2, judgement.pitch
+    rng = np.random.default_rng(0)
+    cells = rng.integers(0, judgement.score.shape, (500, 3))
+    places = corner + (cells + rng.uniform(0.01, 0.99, cells.shape)) * pitch
+    inside = ((places >= BOX[0]) & (places <= BOX[1])).all(axis=1)
+    expected = np.where(inside, (1 - judgement.score[tuple(cells.T)]) / 2, 0.5)
+    found = judgement.doubt(places)
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+    assert found.dtype == np.float32
+    assert len(np.unique(found)) > 1
+    assert judgement.doubt(np.array([[9.0, 0, 0], [np.nan, 0, 0]])).tolist() == [0.5, 0.5]
+    assert judgement.doubt(places.reshape(5, 100, 3)).shape == (5, 100)
+    tensors = judgement.doubt(torch.from_numpy(places.astype(np.float32)))
+    assert isinstance(tensors, torch.Tensor)
+    assert float((tensors.numpy() == found).mean()) > 0.99  # float32 may round over a cell's face
