@@ -25,7 +25,6 @@ PLAIN = {
     "disparity_mae_at_coverage": ("disparity error at equal coverage", "", -1, 3),
     "normal_mean_deg_at_coverage": ("angle of normals at equal coverage", "°", -1, 1),
     "free_space_error": ("opacity left in free space", "", -1, 4),
-    "coverage": ("coverage", "", 1, 3),
 }
 OTHER_TABLES = {
     "every 8th photo": "Scored on every 8th photo of the training sweep, as most papers do: what that hides",
@@ -75,8 +74,8 @@ def page(results: dict[str, Any]) -> str:
         f"A field is fitted to one sweep of photos and scored on another: {len(scenes)} scenes ({', '.join(scenes)}), "
         f"seeds {', '.join(map(str, seeds))}; all that trains does so for equally many steps. Synthetic scenes have "
         "exact depth, normals and visibility, and every place in them is known to be surface or air. The scores' "
-        "convention is `proper` ([what that is](../evaluation.md)); means are over scenes, in brackets elsewhere the "
-        "95 % interval of a bootstrap over scenes.", "",
+        "convention is `proper` ([what that is](../evaluation.md)); means are over scenes (the JSON has 95 % "
+        "intervals of a bootstrap over scenes).", "",
         "**Equal coverage.** Whoever removes more is scored on easier pixels. So every method is cut to the lowest "
         "coverage among all of them on that scene. It gives up the pixels whose depth along the ray is least sharp, "
         "or, if it has an uncertainty of its own (`bayes-rays`; `clean`, whose prior doubts what is there), those of "
@@ -95,7 +94,8 @@ def page(results: dict[str, Any]) -> str:
         "## What is known of every place (synthetic scenes)", "",
         format_rows(rows, ("floater_recall", "surface_kept", "holes_filled", "free_space_error", "ause")), "",
         "`floater_recall`: of what was opaque in the air, no longer opaque. `ause`: how badly the method's uncertainty "
-        "(for all but `bayes-rays`, the spread of a ray's depth) ranks errors of depth; 0 is perfect.", "",
+        "(`bayes-rays` its own, `clean` its prior's doubt, the others the spread of a ray's depth) ranks depth errors "
+        "among the pixels that it is scored on; 0 is perfect.", "",
     ]  # fmt: skip
     knobs = [row for row in results["rows"] if row["table"] == "main" and "@" in row["method"]]
     if knobs:

@@ -58,7 +58,9 @@ def summary_rows(cells: Sequence[Cell]) -> list[dict[str, Any]]:
             row[name], intervals[name] = _mean(mine, [equal.get((_run(cell), method), {}).get(key) for cell in mine])
         row["at_coverage"], _ = _mean(mine, [equal.get((_run(cell), method), {}).get("coverage") for cell in mine])
         for coverage in FIXED:
-            row[f"psnr_at_{coverage:g}"], _ = _mean(mine, [_best(cells, cell, "psnr", coverage) for cell in mine])
+            reached = [_best(cells, cell, "psnr", coverage) for cell in mine]
+            every = all(value is not None for value in reached)  # or hard scenes would drop out of the mean
+            row[f"psnr_at_{coverage:g}"] = _mean(mine, reached)[0] if every else None
         rows.append({**row, "intervals": intervals, "level": 0.95})
     return rows
 
@@ -75,7 +77,7 @@ def finished(cells: Sequence[Cell]) -> list[Cell]:
 
 
 def _run(cell: Cell) -> tuple[Any, ...]:
-    return cell["table"], cell["scene"], cell["seed"]
+    return cell["table"], cell["scene"], cell["seed"], cell.get("steps")
 
 
 def _mean(cells: Sequence[Cell], values: Sequence[float | None]) -> tuple[float | None, list[float | None]]:

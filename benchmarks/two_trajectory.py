@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -124,19 +125,26 @@ class Stage:
     steps: int
 
 
+def _without_folders(word: str) -> str:
+    """A word of the command line without anybody's folders."""
+    return Path(word).name if "/" in word else word
+
+
 class Ledger:
     """Finished rows on disk; each is there whole or not at all."""
 
     def __init__(self, options: Options) -> None:
         self.options = options
-        self.path = options.out / "two_trajectory.json"
+        self.path = options.out / f"two_trajectory{'_short' if options.short else ''}.json"
         stored = json.loads(self.path.read_text(encoding="utf-8")) if self.path.exists() else {}
         self.cells: list[dict[str, Any]] = stored.get("cells", [])
         self.scenes: dict[str, dict[str, Any]] = stored.get("scenes", {})
+        self.commands: list[str] = [each for each in stored.get("command", "").split(" ; ") if each]
 
     def key(self, scene: str, seed: int, method: str, steps: int) -> dict[str, Any]:
         """What a row is known by."""
-        return {"table": self.options.table(), "scene": scene, "seed": seed, "method": method, "steps": steps}
+        named = {"table": self.options.table(), "scene": scene, "seed": seed, "method": method, "steps": steps}
+        return {**named, "fit_steps": self.options.fit_steps, "scene_seed": self.options.scene_seed}
 
     def has(self, key: dict[str, Any]) -> bool:
         """Whether that row is finished."""
@@ -159,12 +167,11 @@ class Ledger:
     def add(self, rows: list[dict[str, Any]]) -> None:
         """Keep rows, and write the file with all means anew."""
         self.cells += [json_ready(row) for row in rows]
-        command = "python benchmarks/two_trajectory.py --capture snowmiku_plush"
-        if self.options.short:
-            command = "python benchmarks/two_trajectory.py --short"
+        command = " ".join(["python benchmarks/two_trajectory.py", *map(_without_folders, sys.argv[1:])])
+        self.commands = [*(each for each in self.commands if each != command), command]
         seeds = sorted({cell["seed"] for cell in self.cells})
         results = build_results(
-            summary_rows(self.cells), command=command, seeds=seeds, convention=CONVENTION,
+            summary_rows(self.cells), command=" ; ".join(self.commands), seeds=seeds, convention=CONVENTION,
             scene_seed=self.options.scene_seed, threads=self.options.threads, scenes=self.scenes, cells=self.cells,
         )  # fmt: skip
         write_results(self.path, json_ready(results))
