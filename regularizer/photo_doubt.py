@@ -1,0 +1,141 @@
+"""Which rendered pixels not to trust, by the photos that a field was trained on. numpy only, no gradient.
+
+A pixel of a new view shows a point. If the point is really there, the photos that see it have the pixel's colour; if
+it is a ghost, they look through it at something else. This needs neither a gradient nor the truth, only renders.
+It says little of depths on a plain wall, where everything has one colour: the prior's doubt
+(:meth:`unghost.regularizer.clean.Judgement.doubt`) does, and :func:`mean_rank` joins the two.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.cameras import Cameras
+
+FloatArray = NDArray[np.float64]
+UNSEEN = 1.0  # the doubt of a point that no photo shows: black held against white
+
+
+def photo_doubt(
+    colors: NDArray[Any],
+    depth: NDArray[Any],
+    cameras: Cameras,
+    *,
+    photos: NDArray[Any],
+    photo_depth: NDArray[Any],
+    photo_cameras: Cameras,
+    tolerance: float = 0.05,
+    slack: float = 0.0,
+) -> NDArray[np.float32]:
+    """How far the colour of each rendered pixel is from the colour that the training photos have there.
+
+    Args:
+        colors: ``(n, H, W, 3)`` rendered views in [0, 1].
+        depth: ``(n, H, W)`` of the same views, along the unit ray, scene units, > 0; inf for none.
+        cameras: of the views.
+        photos: ``(m, h, w, 3)`` that the field was trained on, in [0, 1].
+        photo_depth: ``(m, h, w)`` as the *field* renders it from the photos' cameras, like ``depth``: what lies behind
+            it is not seen by that photo.
+        photo_cameras: of the photos.
+        tolerance: how far behind that depth a point may lie and still be seen, as a share of it; >= 0.
+        slack: the same in scene units, on top; two cells of a grid, say.
+
+    Returns:
+        ``(n, H, W)`` float32 in [0, 1]: mean absolute difference over the channels and over the photos that see the
+        point; 1 where none does.
+
+    Raises:
+        ValueError: shapes, colours outside [0, 1], depth that is not > 0, a negative tolerance or slack.
+    """
+    _check("cameras", cameras, colors=colors, depth=depth)
+    _check("photo_cameras", photo_cameras, photos=photos, photo_depth=photo_depth)
+    for name, value in (("tolerance", tolerance), ("slack", slack)):
+        if not 0 <= value < np.inf:
+            raise ValueError(f"photo_doubt: {name} must be finite and >= 0, got {value}")
+    result = np.full(depth.shape, UNSEEN, dtype=np.float32)
+    for index in range(len(cameras)):
+        known = np.isfinite(depth[index])
+        origins, directions = cameras.rays(index)
+        points = (origins + directions * np.where(known, depth[index], 1.0)[..., None])[known]
+        shown = colors[index][known].astype(np.float64)
+        total, seen = np.zeros(len(points)), np.zeros(len(points), dtype=np.int64)
+        for other in range(len(photo_cameras)):
+            pixels, _, inside = photo_cameras.project(other, points)
+            chosen = np.flatnonzero(inside)
+            column, row = (np.floor(pixels[chosen, axis]).astype(np.int64) for axis in (0, 1))
+            limit = photo_depth[other][
+                np.minimum(row, photo_cameras.height - 1), np.minimum(column, photo_cameras.width - 1)
+            ]
+            distance = np.linalg.norm(points[chosen] - photo_cameras.origins[other], axis=-1)
+            chosen = chosen[distance <= limit * (1.0 + tolerance) + slack]
+            there = sample_bilinear(photos[other], pixels[chosen])
+            total[chosen] += np.abs(there - shown[chosen]).mean(axis=-1)
+            seen[chosen] += 1
+        result[index][known] = np.where(seen > 0, total / np.maximum(seen, 1), UNSEEN)
+    return result
+
+
+def sample_bilinear(image: NDArray[Any], pixels: NDArray[Any]) -> FloatArray:
+    """Colours ``(k, c)`` of an image ``(h, w, c)`` at ``(k, 2)`` columns and rows; the first pixel's centre is .5, .5.
+
+    Beyond the outermost centres the border's colours go on.
+    """
+    height, width = image.shape[:2]
+    x = np.clip(pixels[:, 0] - 0.5, 0, width - 1)
+    y = np.clip(pixels[:, 1] - 0.5, 0, height - 1)
+    left, top = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
+    right, bottom = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
+    a, b = (x - left)[:, None], (y - top)[:, None]
+    upper = (1 - a) * image[top, left] + a * image[top, right]
+    lower = (1 - a) * image[bottom, left] + a * image[bottom, right]
+    return np.asarray((1 - b) * upper + b * lower, dtype=np.float64)
+
+
+def mean_rank(*doubts: NDArray[Any], within: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
+    """Several doubts of the same pixels as one, whatever their units: the mean of each pixel's ranks.
+
+    Args:
+        doubts: of one shape; larger is less sure; inf is allowed, NaN is not.
+        within: bool, the same shape: only these pixels are ranked, the others get 1. None: all.
+
+    Returns:
+        float32 in [0, 1] of that shape: 0 the surest pixel under every doubt. Equals share a rank.
+
+    Raises:
+        ValueError: no doubt, two shapes, a NaN.
+    """
+    if not doubts:
+        raise ValueError("mean_rank: doubts must hold at least one array")
+    shape = doubts[0].shape
+    chosen = np.ones(shape, dtype=np.bool_) if within is None else within
+    for number, each in enumerate((*doubts, chosen)):
+        if each.shape != shape:
+            raise ValueError(f"mean_rank: all arrays must have shape {shape}, got {each.shape}")
+        if number < len(doubts) and np.isnan(each[chosen]).any():
+            raise ValueError(f"mean_rank: doubt {number} holds {int(np.isnan(each[chosen]).sum())} NaN")
+    result = np.ones(shape, dtype=np.float32)
+    count = int(chosen.sum())
+    if count:
+        total = np.zeros(count)
+        for each in doubts:
+            _, place, equals = np.unique(each[chosen], return_inverse=True, return_counts=True)
+            before = np.cumsum(equals) - equals
+            total += (before + (equals - 1) / 2)[place.reshape(-1)] / max(count - 1, 1)
+        result[chosen] = total / len(doubts)
+    return result
+
+
+def _check(lens: str, cameras: Cameras, **maps: NDArray[Any]) -> None:
+    size = (len(cameras), cameras.height, cameras.width)
+    for name, values in maps.items():
+        is_depth = name.endswith("depth")
+        wanted = size if is_depth else (*size, 3)
+        if values.shape != wanted:
+            raise ValueError(f"photo_doubt: {name} must have shape {wanted} for {lens}, got {values.shape}")
+        bad = int((~(values > 0)).sum() if is_depth else (~((values >= -1e-4) & (values <= 1 + 1e-4))).sum())
+        if bad:
+            rule = "be > 0 (inf for none)" if is_depth else "lie in [0, 1]"
+            raise ValueError(f"photo_doubt: {name} must {rule}, {bad} values do not")

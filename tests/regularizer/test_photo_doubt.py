@@ -1,0 +1,139 @@
+"""Doubt by photos: a wall that is where it seems to be is believed, anything else is not."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import rankdata
+
+from unghost.core.cameras import Cameras
+from unghost.regularizer.photo_doubt import mean_rank, photo_doubt, sample_bilinear
+
+SIDE = 24
+
+
+def looking_down(places):
+    """Cameras at (x, y, 2) that look at the plane z = 0."""
+    poses = np.zeros((len(places), 3, 4))
+    poses[:, :, :3], poses[:, :2, 3], poses[:, 2, 3] = np.eye(3), places, 2.0
+    return Cameras.create(poses, np.array([SIDE, SIDE, SIDE / 2, SIDE / 2]), SIDE, SIDE)
+
+
+def wall(cameras, height=0.0):
+    """Photos of a smooth painting on z = 0, and the depth of the plane z = height along the rays."""
+    photos, depths = [], []
+    for index in range(len(cameras)):
+        origins, directions = cameras.rays(index)
+        ground = origins - directions * (origins[..., 2:] / directions[..., 2:])
+        painting = 0.5 + 0.4 * np.stack([np.sin(4 * ground[..., 0]), np.cos(3 * ground[..., 1]),
+                                         np.sin(2 * ground[..., 0] + ground[..., 1])], axis=-1)  # fmt: skip
+        photos.append(painting)
+        depths.append((height - origins[..., 2]) / directions[..., 2])
+    return np.stack(photos), np.stack(depths)
+
+
+def doubt(eval_height, train_height=0.0, **over):
+    seen, taught = looking_down([(0.1, 0.05)]), looking_down([(-0.3, 0.0), (0.3, 0.2), (0.0, -0.3)])
+    colors, _ = wall(seen)
+    _, depth = wall(seen, eval_height)
+    photos, photo_depth = wall(taught, train_height)
+    return photo_doubt(colors, depth, seen, photos=photos, photo_depth=photo_depth, photo_cameras=taught, **over)[0]
+
+
+def test_a_true_wall_is_believed_and_a_ghost_before_it_is_not():
+    true, ghost = doubt(0.0), doubt(0.8)
+    assert np.median(true) < 0.01  # what bilinear sampling leaves
+    assert np.median(ghost[8:-8, 8:-8]) > 10 * np.median(true)
+
+
+def test_what_the_field_hides_from_a_photo_is_not_held_against_it():
+    assert (doubt(0.0, train_height=1.0) == 1.0).all()  # everything lies far behind what the photos' cameras see
+    assert (doubt(0.0, train_height=1.0, slack=3.0) < 1.0).any()
+    assert (doubt(0.0, train_height=0.05) == 1.0).sum() == (doubt(0.0) == 1.0).sum()  # within 5 %
+    assert (doubt(0.0, train_height=0.05, tolerance=0.0) == 1.0).all()
+
+
+def test_by_hand_for_one_pixel_and_one_that_nobody_sees():
+    camera = looking_down([(0.0, 0.0)])
+    grey = np.full((1, SIDE, SIDE, 3), 0.25)
+    depth = np.full((1, SIDE, SIDE), 2.0)
+    depth[0, 0, 0] = np.inf
+    photos = np.full((1, SIDE, SIDE, 3), (0.25, 0.5, 1.0))
+    found = photo_doubt(grey, depth, camera, photos=photos, photo_depth=depth, photo_cameras=camera)
+    assert found.dtype == np.float32
+    assert found[0, 0, 0] == 1.0
+    np.testing.assert_allclose(found[0, 5:-5, 5:-5], (0.0 + 0.25 + 0.75) / 3, rtol=1e-6)
+
+
+def test_the_mean_over_photos_does_not_depend_on_their_order():
+    seen, taught = looking_down([(0.0, 0.0)]), looking_down([(-0.4, 0.0), (0.5, 0.2), (0.0, -0.3)])
+    colors, depth = wall(seen, 0.3)
+    photos, photo_depth = wall(taught)
+
+    def found(order):
+        return photo_doubt(colors, depth, seen, photos=photos[order], photo_depth=photo_depth[order],
+                           photo_cameras=taught.select(order))  # fmt: skip
+
+    np.testing.assert_allclose(found([0, 1, 2]), found([2, 0, 1]), rtol=1e-5)
+    singles = np.stack([found([index]) for index in range(3)])
+    together, everywhere = found([0, 1, 2]), (singles < 1).all(axis=0)
+    assert everywhere.any()
+    np.testing.assert_allclose(together[everywhere], singles.mean(axis=0)[everywhere], rtol=1e-5)
+
+
+def test_bilinear_samples_agree_with_scipy():
+    from scipy.ndimage import map_coordinates
+
+    rng = np.random.default_rng(0)
+    image, pixels = rng.uniform(size=(7, 9, 3)), rng.uniform(-1, 11, size=(200, 2))
+    wanted = np.stack([map_coordinates(image[..., channel], [pixels[:, 1] - 0.5, pixels[:, 0] - 0.5], order=1,
+                                       mode="nearest") for channel in range(3)], axis=-1)  # fmt: skip
+    np.testing.assert_allclose(sample_bilinear(image, pixels), wanted, atol=1e-12)
+
+
+@given(st.lists(st.lists(st.integers(0, 5), min_size=6, max_size=6), min_size=1, max_size=3))
+def test_ranks_agree_with_scipy(rows):
+    doubts = [np.array(row, dtype=np.float64).reshape(2, 3) for row in rows]
+    wanted = np.mean([(rankdata(each) - 1) / 5 for each in doubts], axis=0).reshape(2, 3)
+    np.testing.assert_allclose(mean_rank(*doubts), wanted, atol=1e-6)
+
+
+def test_ranks_within_a_mask():
+    values = np.array([[5.0, np.nan, 1.0, np.inf]])
+    within = np.array([[True, False, True, True]])
+    np.testing.assert_array_equal(mean_rank(values, within=within), [[0.5, 1.0, 0.0, 1.0]])
+    assert (mean_rank(values, within=np.zeros((1, 4), dtype=bool)) == 1.0).all()
+    assert mean_rank(np.array([3.0])) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"colors": np.zeros((1, SIDE, SIDE))}, r"colors must have shape \(1, 24, 24, 3\) for cameras"),
+        ({"photos": np.full((1, SIDE, SIDE, 3), 255.0)}, r"photos must lie in \[0, 1\], 1728 values do not"),
+        ({"depth": np.zeros((1, SIDE, SIDE))}, "depth must be > 0"),
+        ({"photo_depth": np.full((1, SIDE, SIDE), np.nan)}, "photo_depth must be > 0 .*, 576 values do not"),
+        ({"tolerance": -1.0}, "tolerance must be finite and >= 0, got -1.0"),
+        ({"slack": np.inf}, "slack must be finite"),
+    ],
+)
+def test_errors_name_argument_and_rule(change, message):
+    camera = looking_down([(0.0, 0.0)])
+    grey, depth = np.full((1, SIDE, SIDE, 3), 0.5), np.full((1, SIDE, SIDE), 2.0)
+    given = {"colors": grey, "depth": depth, "cameras": camera, "photos": grey, "photo_depth": depth,
+             "photo_cameras": camera, **change}  # fmt: skip
+    with pytest.raises(ValueError, match=f"photo_doubt: {message}"):
+        photo_doubt(**given)
+
+
+@pytest.mark.parametrize(
+    ("doubts", "message"),
+    [
+        ((), "at least one"),
+        ((np.zeros(3), np.zeros(4)), r"shape \(3,\), got \(4,\)"),
+        ((np.zeros(2), np.array([0.0, np.nan])), "doubt 1 holds 1 NaN"),
+    ],
+)
+def test_errors_of_ranks(doubts, message):
+    with pytest.raises(ValueError, match=f"mean_rank: .*{message}"):
+        mean_rank(*doubts)
