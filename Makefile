@@ -85,8 +85,9 @@ demo-setup: $(MADE)/demo
 demo: demo-setup
 	@$(BIN)/unghost demo
 
+# Two processes of one thread each: most tests are too small to share between threads.
 test: setup $(MADE)/browser
-	$(BIN)/python -m pytest
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 
 check: setup
 	$(BIN)/ruff check .
