@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from trajectory_job import Job, Outcome, fine_tuned, make_regularizer, visibility
+from trajectory_job import Job, Outcome, fine_tuned, make_regularizer
 from trajectory_methods import PAPER_PRIOR, paper, paper_timestep, restoration
 
 from unghost import load_denoiser
@@ -26,7 +26,7 @@ def through_activation(job: Job, how: Squash) -> list[Outcome]:
     """The paper's "why not just": SDS, with noise, through a clamp or a sigmoid; beside the visibility loss."""
     denoiser = load_denoiser(str(PAPER_PRIOR), backend="onnx", threads=job.threads)
     settings = RegularizerSettings.paper(cubes=job.cubes, seed=job.seed)
-    regularizer = visibility(job)
+    regularizer = make_regularizer(job, denoiser=denoiser, settings=RegularizerSettings.paper(dsds_weight=0.0))
     cumulative = alphas_cumprod()
 
     def term(field: Any, step: int) -> Tensor:
@@ -39,9 +39,10 @@ def through_activation(job: Job, how: Squash) -> list[Outcome]:
         noised = np.sqrt(alpha) * signed.detach().numpy() + np.sqrt(1 - alpha) * noise
         fractions = cubes.edge_fraction.astype(np.float32)
         x0_pred = denoiser(noised[:, None].astype(np.float32), np.full(len(noised), t, np.int64), fractions)[:, 0]
-        return settings.dsds_weight * sds_loss(signed, torch.from_numpy(x0_pred), alpha_cumprod=alpha).mean()
+        loss = sds_loss(signed, torch.from_numpy(x0_pred), alpha_cumprod=alpha)
+        return settings.dsds_weight * loss[cubes.inside].sum() / max(int(cubes.inside.sum()), 1)
 
-    return [fine_tuned(job, regularizer, term)]
+    return [fine_tuned(job, lambda job: regularizer, term)]
 
 
 def by_weights(job: Job) -> list[Outcome]:
@@ -62,7 +63,7 @@ def by_weights(job: Job) -> list[Outcome]:
         regularizer.grid.values[:], regularizer.grid.observed[:] = weights, observed
         return torch.zeros(())
 
-    return [fine_tuned(job, regularizer, unchanged, observed=False)]
+    return [fine_tuned(job, lambda job: regularizer, unchanged, observed=False)]
 
 
 ABLATION: dict[str, Callable[[Job], list[Outcome]]] = {

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import copy
+import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -75,31 +76,46 @@ class Outcome:
 
     Attributes:
         field: to be rendered and asked.
-        seconds: that it took.
+        seconds: that it took, by the clock.
+        cpu_seconds: of both cores together: what it takes when nothing else runs.
         steps: of training; 0 for none.
         knob: where the method's knob stood; None without one.
         uncertainty: ``positions -> (M,)``, the method's own, averaged along rays; None: how far a ray's depth spreads.
         background_uncertainty: of light that gets through.
+        asks_photos: the method's own order of pixels is the mean of the ranks by ``uncertainty`` and by photo doubt.
         note: for the row.
     """
 
     field: Any
     seconds: float
+    cpu_seconds: float = 0.0
     steps: int = 0
     knob: float | None = None
     uncertainty: Callable[[Tensor], Tensor] | None = None
     background_uncertainty: float = 0.0
+    asks_photos: bool = False
     note: str = ""
-    details: dict[str, Any] = field(default_factory=dict)
 
 
-def render(outcome: Outcome, scene: TrajectoryScene, cameras: Cameras) -> Views:
-    """``rgb (n, H, W, 3)``, ``depth``, ``accumulation``, ``spread`` and ``uncertainty (n, H, W)``."""
-    views = [render_view(outcome.field, cameras, index, sampling=scene.sampling, values=outcome.uncertainty)
+class Clock:
+    """Seconds since it was made, as the fields of :class:`Outcome` are called."""
+
+    def __init__(self) -> None:
+        self._begun = time.perf_counter(), time.process_time()
+
+    def read(self) -> dict[str, float]:
+        """By the clock, and of all threads together."""
+        now = time.perf_counter(), time.process_time()
+        return {"seconds": now[0] - self._begun[0], "cpu_seconds": now[1] - self._begun[1]}
+
+
+def render(outcome: Outcome, scene: TrajectoryScene, cameras: Cameras, *, values: bool = True) -> Views:
+    """``rgb (n, H, W, 3)``, ``depth``, ``accumulation``, ``spread``; with ``values``, the method's ``uncertainty``."""
+    asked = outcome.uncertainty if values else None
+    views = [render_view(outcome.field, cameras, index, sampling=scene.sampling, values=asked)
              for index in range(len(cameras))]  # fmt: skip
     stacked = {key: np.stack([view[key] for view in views]) for key in views[0]}
-    stacked["uncertainty"] = stacked["spread"]
-    if outcome.uncertainty is not None:
+    if asked is not None:
         through = 1.0 - stacked["accumulation"]
         stacked["uncertainty"] = stacked.pop("values") + through * outcome.background_uncertainty
     return stacked
@@ -117,22 +133,30 @@ def make_regularizer(
 
 
 def fine_tuned(
-    job: Job, regularizer: Any = None, *terms: Term, config: TrainingConfig | None = None, note: str = "",
-    observed: bool = True,
+    job: Job, make: Callable[[Job], Any] | None = None, *terms: Term, config: TrainingConfig | None = None,
+    note: str = "", observed: bool = True,
 ) -> Outcome:  # fmt: skip
-    """A copy of the field after more training with a regularizer's losses and further terms."""
+    """A copy of the field after more training with a regularizer's losses and further terms.
+
+    ``make``: of the regularizer, whose making is timed, too. ``observed``: it learns of the rays' densities, if it has
+    cubes to place.
+    """
+    clock = Clock()
+    regularizer = None if make is None else make(job)
     tuned = copy.deepcopy(job.base)
     parts: list[Term] = list(terms)
+    watched = None
     if regularizer is not None:
         parts.insert(0, lambda field, step: sum(regularizer(field.density_fn).values()))
-    watched = regularizer.observe if regularizer is not None and observed else None
-    budget: dict[str, Any] = {"steps": job.steps} if job.seconds is None else {"seconds": job.seconds}
+        watched = regularizer.observe if observed and regularizer.settings.dsds_weight > 0 else None
+    left = None if job.seconds is None else max(job.seconds - clock.read()["seconds"], 1e-3)
+    budget: dict[str, Any] = {"steps": job.steps} if left is None else {"seconds": left}
     record = train_field(
         tuned, job.scene.train.cameras, job.scene.train.photos, seed=job.seed, config=config or job.fitting,
         fine_tune=True, observer=watched,
         regularizer=(lambda field, step: sum(part(field, step) for part in parts)) if parts else None, **budget,
     )  # fmt: skip
-    return Outcome(tuned, record["seconds"], record["steps"], note=note)
+    return Outcome(tuned, **clock.read(), steps=record["steps"], note=note)
 
 
 def visibility(job: Job) -> Any:

@@ -17,8 +17,9 @@ import tyro
 from fit_cache import FitCache, say
 from trajectory_job import Job, Views, render
 from trajectory_methods import METHODS
+from trajectory_scores import Stage
 from two_trajectory import Options as Benchmark
-from two_trajectory import Stage, fitted, stages
+from two_trajectory import fitted, stages
 
 from unghost.evaluation.report import draw_comparison
 

@@ -93,6 +93,7 @@ class TrajectoryScene:
         if self.photographed is None or self.again is None:
             return make_pseudo_truth(seen, train, depth_of(seen), train_depth=depth_of(train))
         first, again = self.photographed, self.again
+        seen = again.true_cameras  # not what a held-out photo is told to be of
         depth = ray_depth(again.depth_maps, seen)
         normals = np.full((*depth.shape, 3), np.nan)
         for index in range(len(seen)):
@@ -202,4 +203,5 @@ def captured_scene(folder: Path, train: str, evaluation: str, *, downscale: floa
               for chosen in (capture.split(train), capture.split(evaluation))]  # fmt: skip
     if set(capture.split(train)) & set(capture.split(evaluation)):
         raise ValueError(f"{train} and {evaluation} share photos")
-    return TrajectoryScene(folder.resolve().name, *sweeps, 160, Sampling(), 4096)
+    name = f"{folder.resolve().name} {train} to {evaluation} at 1:{downscale:g}"
+    return TrajectoryScene(name, *sweeps, 160, Sampling(), 4096)

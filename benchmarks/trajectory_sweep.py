@@ -20,17 +20,18 @@ from fit_cache import FitCache, say
 from trajectory_job import Job, Weights
 from trajectory_methods import METHODS
 from trajectory_scenes import synthetic_scene
+from trajectory_scores import Stage, scored
 from trajectory_tables import summary_rows
 from two_trajectory import Options as Benchmark
-from two_trajectory import Stage, fitted, scored
+from two_trajectory import fitted
 
 from unghost.core.results import build_results, write_results
 from unghost.evaluation.protocol import json_ready
 
 ROOT = Path(__file__).resolve().parents[1]
 FACTORS = {
-    "sparsity": (1e-4, 1e-3, 1e-2), "tv": (1e-4, 1e-3, 1e-2), "regnerf": (1e-4, 1e-3, 1e-2),
-    "distortion": (4e-3, 2e-2, 1e-1), "free_space": (1e-4, 1e-3, 1e-2),
+    "sparsity": (1e-4, 1e-3, 1e-2, 1e-1), "tv": (1e-3, 1e-2, 1e-1, 1.0), "regnerf": (1e-3, 1e-2, 1e-1, 1.0),
+    "distortion": (4e-3, 2e-2, 1e-1, 5e-1), "free_space": (1e-6, 1e-5, 1e-4, 1e-3),
 }  # fmt: skip
 ROWS = {"free_space": "free-space"}
 
@@ -49,7 +50,7 @@ class Options:
         cache: where fitted fields are kept.
     """
 
-    scenes: tuple[str, ...] = ("room-1",)
+    scenes: tuple[str, ...] = ("room-1", "objects-3")
     scene_seed: int = 555
     losses: tuple[str, ...] = tuple(FACTORS)
     fit_steps: int = 450
@@ -72,7 +73,7 @@ def main() -> None:
             method = METHODS[ROWS.get(loss, f"visibility+{loss}")]
             for factor in FACTORS[loss]:
                 job = Job(scene, base, 0, options.steps, weights=dataclasses.replace(Weights(), **{loss: factor}))
-                row = scored(stage, method(job)[0], None)
+                row = scored(stage, method(job)[0], None, headline=False)
                 cells.append({"table": loss, "scene": name, "seed": 0, "method": f"{factor:g}", **row})
                 say(f"{name} {loss} {factor:g}: psnr {row['psnr']:.2f} coverage {row['coverage']:.3f} "
                     f"disparity {row['disparity_mae']:.3f}")  # fmt: skip

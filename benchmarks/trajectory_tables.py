@@ -1,7 +1,9 @@
 """Means, tables and figures of the two-trajectory benchmark, from its finished rows.
 
 ``psnr_at_coverage`` and its like compare methods on a scene and seed where every one of them is cut to the lowest
-coverage among them; between two measured coverages a score is interpolated linearly (``evaluation/curves.py``).
+coverage among them, each at its own setting and in its own order of pixels; ``_by_spread`` and ``_by_photos``: all in
+that order; ``_at_best``: the setting of its knob and the order that are best for it there, which takes an eye on the
+truth. Between two measured coverages a score is interpolated linearly (``evaluation/curves.py``).
 """
 
 from __future__ import annotations
@@ -18,18 +20,20 @@ from unghost.evaluation.intervals import bootstrap_scenes
 
 KEYS = (
     "psnr", "ssim", "flip", "depth_mse", "disparity_mae", "normal_mean_deg", "normal_median_deg", "normal_pct_30",
-    "coverage", "psnr_visible", "ause", "floater_recall", "surface_kept", "holes_filled", "free_space_error",
-    "strength", "seconds",
+    "coverage", "images_scored", "psnr_visible", "ause", "ause_by_spread", "ause_by_photos", "floater_recall",
+    "surface_kept", "holes_filled", "free_space_error", "seconds", "cpu_seconds",
 )  # fmt: skip
 AT_EQUAL = ("psnr", "ssim", "disparity_mae", "normal_mean_deg")
 LOWER_IS_BETTER = ("disparity_mae", "normal_mean_deg")
 FIXED = (0.3, 0.4, 0.5)
+ORDERS = {"": "own", "_by_spread": "spread", "_by_photos": "photos", "_at_best": None}
 REFERENCE = "pseudo-gt"
 FEWER_SEEDS = (REFERENCE, "dsds-paper")
 COLORS = {
-    "pseudo-gt": "#bbbbbb", "field": "#444444", "visibility": "#1f77b4", "visibility+sparsity": "#9ecae1",
-    "visibility+tv": "#17becf", "visibility+regnerf": "#74c476", "visibility+distortion": "#9467bd",
-    "free-space": "#e7ba52", "bayes-rays": "#2ca02c", "components": "#8c564b", "dsds-paper": "#f7b6d2",
+    "pseudo-gt": "#bbbbbb", "fitted": "#888888", "field": "#444444", "visibility": "#1f77b4",
+    "visibility+sparsity": "#9ecae1", "visibility+tv": "#17becf", "visibility+regnerf": "#74c476",
+    "visibility+distortion": "#9467bd", "free-space": "#e7ba52",
+    "bayes-rays": "#2ca02c", "components": "#8c564b", "dsds-paper": "#f7b6d2",
     "dsds-restoration": "#d62728", "clean": "#ff7f0e", "visibility+clean": "#ffbb78",
 }  # fmt: skip
 STRONG = ("field", "visibility", "visibility+distortion", "bayes-rays", "dsds-restoration", "clean")
@@ -52,17 +56,24 @@ def summary_rows(cells: Sequence[Cell]) -> list[dict[str, Any]]:
         }  # fmt: skip
         intervals = {}
         for key in KEYS:
-            row[key], intervals[key] = _mean(mine, [cell.get(key) for cell in mine])
-        for key in AT_EQUAL:
-            name = f"{key}_at_coverage"
-            row[name], intervals[name] = _mean(mine, [equal.get((_run(cell), method), {}).get(key) for cell in mine])
+            row[key], intervals[key] = _mean(mine, [_plain(cell, key) for cell in mine])
+        for key in (f"{key}_at_coverage{order}" for key in AT_EQUAL for order in ORDERS):
+            row[key], intervals[key] = _mean(mine, [equal.get((_run(cell), method), {}).get(key) for cell in mine])
         row["at_coverage"], _ = _mean(mine, [equal.get((_run(cell), method), {}).get("coverage") for cell in mine])
         for coverage in FIXED:
-            reached = [_best(cells, cell, "psnr", coverage) for cell in mine]
+            reached = [score_at(cells, cell, "psnr", coverage) for cell in mine]
             every = all(value is not None for value in reached)  # or hard scenes would drop out of the mean
             row[f"psnr_at_{coverage:g}"] = _mean(mine, reached)[0] if every else None
         rows.append({**row, "intervals": intervals, "level": 0.95})
     return rows
+
+
+def _plain(cell: Cell, key: str) -> float | None:
+    """A number of a cell; ``ause`` and its like are kept by order."""
+    if key.startswith("ause"):
+        value: float | None = cell.get("ause", {}).get(ORDERS[key.removeprefix("ause")])
+        return value
+    return cell.get(key)
 
 
 def finished(cells: Sequence[Cell]) -> list[Cell]:
@@ -89,42 +100,49 @@ def _mean(cells: Sequence[Cell], values: Sequence[float | None]) -> tuple[float 
     return found.mean, [found.low, found.high]
 
 
-def _curves(cell: Cell, key: str) -> list[Curve]:
-    """Cut by the sharpness of each pixel's depth and, where the method has one, by its own uncertainty."""
-    curves = []
-    for name in ("curve", "curve_own"):
-        points = [each for each in cell.get(name, []) if each.get(key) is not None and each.get("coverage") is not None]
-        if points:
-            rows = [{**point, "convention": cell["convention"]} for point in points]
-            curves.append(Curve.create(cell["method"], rows, metric=key, higher_is_better=key not in LOWER_IS_BETTER))
-    return curves
+def _curve(cell: Cell, order: str, key: str) -> Curve | None:
+    """Cut in one order of pixels; None where there is no score."""
+    columns = cell.get("curves", {}).get(order, {})
+    points = zip(columns.get("coverage", ()), columns.get(key, ()))
+    rows = [{"coverage": coverage, key: value, "convention": cell["convention"]}
+            for coverage, value in points if value is not None]  # fmt: skip
+    if not rows:
+        return None
+    return Curve.create(cell["method"], rows, metric=key, higher_is_better=key not in LOWER_IS_BETTER)
 
 
-def _best(cells: Sequence[Cell], cell: Cell, key: str, coverage: float) -> float | None:
-    """A method's score at a coverage on one run, its knob and its way to give up pixels turned to their best."""
-    same = [other for other in cells if _run(other) == _run(cell)
-            and (other is cell or other["method"].startswith(f"{cell['method']} @ "))]  # fmt: skip
-    curves = [curve for each in same for curve in _curves(each, key)]
-    found = [value for value in (curve.at(coverage) for curve in curves) if value is not None]
+def score_at(cells: Sequence[Cell], cell: Cell, key: str, coverage: float, order: str | None = "own") -> float | None:
+    """A method's score at a coverage on one run; ``order`` None: at its best setting, in the order best for it."""
+    same, orders = [cell], [order]
+    if order is None:
+        same += [other for other in cells if _run(other) == _run(cell)
+                 and other["method"].startswith(f"{cell['method']} @ ")]  # fmt: skip
+        orders = ["own", "spread", "photos"]
+    curves = [_curve(each, name, key) for each in same for name in orders if name is not None]
+    found = [value for value in (curve.at(coverage) for curve in curves if curve is not None) if value is not None]
     return (min if key in LOWER_IS_BETTER else max)(found, default=None)
 
 
 def _at_equal_coverage(cells: Sequence[Cell]) -> dict[tuple[Any, str], dict[str, float | None]]:
     """(run, method) -> scores where all methods of the run are cut to the lowest coverage among them.
 
-    Other settings of a knob (``method @ knob``) do not lower the bar, and neither does the reference.
+    Other settings of a knob (``method @ knob``) do not lower the bar, and neither does the reference. A run in which
+    somebody covers less than any curve reaches is left out for all: scores at two coverages do not compare.
     """
     result: dict[tuple[Any, str], dict[str, float | None]] = {}
     for run in dict.fromkeys(map(_run, cells)):
         mine = [cell for cell in cells if _run(cell) == run]
-        bar = [cell["coverage"] for cell in mine if cell["coverage"] and "@" not in cell["method"]
-               and cell["method"] != REFERENCE]  # fmt: skip
-        if not bar:
+        compared = [cell for cell in mine if "@" not in cell["method"] and cell["method"] != REFERENCE]
+        lowest = min((cell["coverage"] or 0.0 for cell in compared), default=0.0)
+        reached = [score_at(mine, cell, "psnr", lowest, "spread") for cell in compared]
+        if not lowest or any(value is None for value in reached):
             continue
-        lowest = min(bar)
         for cell in mine:
-            at_bar = {key: _best(mine, cell, key, lowest) for key in AT_EQUAL}
-            result[run, cell["method"]] = {"coverage": lowest, **at_bar}
+            found: dict[str, float | None] = {
+                f"{key}_at_coverage{name}": score_at(mine, cell, key, lowest, order)
+                for key in AT_EQUAL for name, order in ORDERS.items()
+            }  # fmt: skip
+            result[run, cell["method"]] = {"coverage": lowest, **found}
     return result
 
 
@@ -179,13 +197,29 @@ def write_figures(path: Path) -> None:
     figure.savefig(path.with_suffix(".png"), dpi=110, metadata={"Software": None})
 
 
+def per_scene(cells: Sequence[Cell], methods: Sequence[str], key: str) -> dict[str, dict[str, float]]:
+    """Method -> scene -> mean over the seeds of the main table, of anything that a row has; undefined ones are left
+    out."""
+    cells = [cell for cell in finished(cells) if cell["table"] == "main"]
+    equal = _at_equal_coverage(cells)
+    result: dict[str, dict[str, float]] = {}
+    for method in methods:
+        values: dict[str, list[float]] = {}
+        for cell in cells:
+            found = equal.get((_run(cell), method), {}).get(key, _plain(cell, key))
+            if cell["method"] == method and found is not None:
+                values.setdefault(cell["scene"], []).append(found)
+        result[method] = {scene: float(np.mean(each)) for scene, each in values.items()}
+    return result
+
+
 def mean_curve(cells: Sequence[Cell], method: str, key: str) -> list[tuple[float, float]]:
     """(coverage, mean) at coverages that every run of a method reaches."""
     cells = [cell for cell in finished(cells) if cell["table"] == "main"]
     mine = [cell for cell in cells if cell["method"] == method]
     found = []
     for coverage in np.round(np.arange(0.1, 1.0, 0.05), 2):
-        values = [_best(cells, cell, key, float(coverage)) for cell in mine]
+        values = [score_at(cells, cell, key, float(coverage)) for cell in mine]
         if values and all(value is not None for value in values):
             found.append((float(coverage), float(np.mean([value for value in values if value is not None]))))
     return found

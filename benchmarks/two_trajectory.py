@@ -5,12 +5,12 @@
     python benchmarks/two_trajectory.py --scenes room-0 --methods field visibility
 
 A field is fitted to one sweep of photos, every method improves it (``trajectory_methods.py``) for the same steps, and
-each is scored on another sweep under the convention ``proper``, at its own coverage and cut to others: it gives up the
-pixels whose depth is least sharp, or of which it is least sure by its own account, whichever is better for it, and has
-its knob, if any, turned to its best at every coverage. Every finished row is saved at once in
+each is scored on another sweep under the convention ``proper``, at its own coverage and cut to others, in several
+orders of pixels (``trajectory_scores.py``). Every finished row is saved at once in
 ``docs/results/two_trajectory.json``; what is there is not done again, so that a run that was broken off goes on with
-the same command. ``--equal-seconds`` trains for as long as ``visibility`` took, ``--ablation`` does the paper's
-ablation, ``--every-eighth`` scores every 8th photo of the first sweep. The page: ``trajectory_page.py``.
+the same command. ``--equal-seconds`` trains for as long as ``visibility`` took (the median of the main table),
+``--ablation`` does the paper's ablation, ``--every-eighth`` scores every 8th photo of the first sweep. The page:
+``trajectory_page.py``.
 """
 
 from __future__ import annotations
@@ -30,28 +30,20 @@ import tyro
 from fit_cache import FitCache, Plan, say
 from numpy.typing import NDArray
 from trajectory_ablation import ABLATION
-from trajectory_job import Job, Outcome, Views, render
-from trajectory_methods import METHODS
+from trajectory_job import Job, Outcome
+from trajectory_methods import METHODS, UNTRAINED
 from trajectory_scenes import LabelledSpace, Sweep, TrajectoryScene, captured_scene, synthetic_scene
+from trajectory_scores import CONVENTION, Stage, scored
 from trajectory_tables import summary_rows, write_figures
 
 from unghost.core.results import build_results, write_results
-from unghost.evaluation.conventions import evaluation_masks, get_convention
-from unghost.evaluation.curves import cut_to_coverage
 from unghost.evaluation.difficulty import difficulty_rows
 from unghost.evaluation.protocol import json_ready
-from unghost.evaluation.pseudo import PseudoTruth
-from unghost.evaluation.scoring import score_scene, score_under_all
-from unghost.evaluation.sparsification import sparsify
-from unghost.evaluation.views import Renders, Truth
 from unghost.fields.radiance import RadianceConfig, RadianceField
 from unghost.fields.rendering import render_view
 from unghost.fields.training import TrainingConfig, train_field
 
 ROOT = Path(__file__).resolve().parents[1]
-CONVENTION = "proper"
-COVERAGES = tuple(round(0.05 * step, 2) for step in range(2, 20))
-CURVE_KEYS = ("psnr", "ssim", "disparity_mae", "normal_mean_deg")
 SCENES = ("room-0", "room-1", "room-2", "room-5", "objects-4", "objects-27")
 SHORT_SCENES = ("room-1", "objects-4")
 
@@ -105,6 +97,13 @@ class Options:
             return self
         return dataclasses.replace(self, scenes=SHORT_SCENES, seeds=(0,), fit_steps=150, steps=50)
 
+    def names(self) -> tuple[str, ...]:
+        """Methods of the table; those that do not train have nothing to do with equal seconds."""
+        if self.ablation:
+            return tuple(ABLATION)
+        left_out = (*UNTRAINED, "pseudo-gt") if self.equal_seconds else ()
+        return tuple(name for name in self.methods if name not in left_out)
+
     def table(self) -> str:
         """Which of the tables the rows belong to."""
         chosen = {"ablation": self.ablation, "equal seconds": self.equal_seconds, "every 8th photo": self.every_eighth}
@@ -112,17 +111,6 @@ class Options:
         if len(named) > 1:
             raise ValueError(f"two_trajectory: one table at a time, got {' and '.join(named)}")
         return named[0] if named else "main"
-
-
-@dataclass(frozen=True, eq=False)
-class Stage:
-    """One scene with the truth about it."""
-
-    scene: TrajectoryScene
-    pseudo: PseudoTruth
-    truth: Truth
-    fit_steps: int
-    steps: int
 
 
 def _without_folders(word: str) -> str:
@@ -150,12 +138,13 @@ class Ledger:
         """Whether that row is finished."""
         return any(all(cell.get(name) == value for name, value in key.items()) for cell in self.cells)
 
-    def seconds_of(self, scene: str, seed: int, method: str) -> float:
-        """What a method of the main table took there."""
-        for cell in self.cells:
-            if (cell["table"], cell["scene"], cell["seed"], cell["method"]) == ("main", scene, seed, method):
-                return float(cell["seconds"])
-        raise ValueError(f"two_trajectory: equal seconds are those of {method}: do the main table of {scene} first")
+    def seconds_of(self, scene: str, method: str) -> float:
+        """What a method of the main table took there, the median over seeds."""
+        took = [float(cell["seconds"]) for cell in self.cells
+                if (cell["table"], cell["scene"], cell["method"]) == ("main", scene, method)]  # fmt: skip
+        if not took:
+            raise ValueError(f"two_trajectory: equal seconds are those of {method}: do the main table of {scene} first")
+        return float(np.median(took))
 
     def describe(self, stage: Stage) -> None:
         """How hard a scene is, and how much of its evaluation views was seen."""
@@ -211,62 +200,12 @@ def stages(options: Options, cache: FitCache) -> Iterator[Stage]:
         yield Stage(scene, pseudo, scene.truth(pseudo), fit_steps, steps)
 
 
-def scored(stage: Stage, outcome: Outcome, space: LabelledSpace | None, *, conventions: bool = False) -> dict[str, Any]:
-    """All that a row says of one setting of a method; ``conventions``: under every published one, too."""
-    views = render(outcome, stage.scene, stage.scene.evaluation.cameras)
-    renders = Renders(np.clip(views["rgb"], 0, 1), views["depth"], np.clip(views["accumulation"], 0, 1))
-    extent = stage.scene.extent
-    means = score_scene(renders, stage.truth, extent, convention=CONVENTION).means()
-    mask = evaluation_masks(get_convention(CONVENTION), renders, stage.truth, extent)
-    whole = {"coverage": means["coverage"], **{key: means[key] for key in CURVE_KEYS}}
-
-    def curve(uncertainty: NDArray[Any]) -> list[dict[str, Any]]:
-        """Scores of the surest pixels, as many as each coverage asks for."""
-        points = [whole]
-        for coverage in (each for each in COVERAGES if each < means["coverage"]):
-            cut = cut_to_coverage(mask, -uncertainty, coverage=coverage)
-            point = score_scene(renders, stage.truth, extent, convention=CONVENTION, within=cut, keys=CURVE_KEYS)
-            points.append({"coverage": coverage, **{key: point.means()[key] for key in CURVE_KEYS}})
-        return points
-
-    row = {"convention": CONVENTION, **means, "psnr_visible": _psnr_visible(renders, stage.truth)}
-    row["curve"] = curve(views["spread"])
-    if outcome.uncertainty is not None:
-        row["curve_own"] = curve(views["uncertainty"])
-    row["ause"] = _ause(views, stage, mask)
-    if conventions:
-        under = score_under_all(renders, stage.truth, extent)
-        row["conventions"] = {name: each.means() for name, each in under.items() if each.images}
-    if space is not None:
-        row |= space.scores(outcome.field)
-    return {**row, "seconds": outcome.seconds, "trained_steps": outcome.steps, "knob": outcome.knob,
-            "note": outcome.note, **outcome.details}  # fmt: skip
-
-
-def _psnr_visible(renders: Renders, truth: Truth) -> float | None:
-    """Of all pixels that a training photo saw, whatever is rendered there: nothing can be gained by removing."""
-    errors = np.mean((renders.colours.astype(np.float64) - truth.photos) ** 2, axis=-1)
-    assert truth.visible is not None
-    values = [-10 * np.log10(error[seen].mean()) for error, seen in zip(errors, truth.visible) if seen.any()]
-    return float(np.mean(values)) if values else None
-
-
-def _ause(views: Views, stage: Stage, mask: NDArray[np.bool_]) -> float | None:
-    """How well the method's uncertainty ranks errors of depth: area under the sparsification error curve, 0 is best."""
-    true = stage.pseudo.depth
-    both = mask & np.isfinite(true)
-    if not both.any():
-        return None
-    error = np.abs(np.where(both, views["depth"], 0.0) - np.where(both, true, 0.0))
-    return sparsify(error, views["uncertainty"], both).ause
-
-
 def rows_of(key: dict[str, Any], stage: Stage, outcomes: list[Outcome], space: LabelledSpace | None) -> Any:
     """A row for the method, and one for every other setting of its knob, named ``method @ knob``."""
     rows = []
     for number, outcome in enumerate(outcomes):
         name = key["method"] if number == 0 else f"{key['method']} @ {outcome.knob:g}"
-        found = scored(stage, outcome, space, conventions=name == "field")
+        found = scored(stage, outcome, space, conventions=name == "field", headline=number == 0)
         rows.append({**key, "method": name, **found})
     return rows
 
@@ -276,7 +215,7 @@ def run_stage(options: Options, stage: Stage, cache: FitCache, ledger: Ledger, p
     scene = stage.scene
     ledger.describe(stage)
     table: dict[str, Callable[[Job], list[Outcome]]] = ABLATION if options.ablation else METHODS
-    names = tuple(ABLATION) if options.ablation else options.methods
+    names = options.names()
     for seed in options.seeds:
         keys = {name: ledger.key(scene.name, seed, name, stage.steps) for name in names}
         base: RadianceField | None = None
@@ -293,7 +232,7 @@ def run_stage(options: Options, stage: Stage, cache: FitCache, ledger: Ledger, p
                 better, seconds = fitted(options, cache, "pseudo", scene, both, seed, stage.fit_steps)
                 outcomes = [Outcome(better, seconds)]
             else:
-                budget = ledger.seconds_of(scene.name, seed, "visibility") if options.equal_seconds else None
+                budget = ledger.seconds_of(scene.name, "visibility") if options.equal_seconds else None
                 outcomes = table[name](Job(scene, base, seed, stage.steps, budget, threads=options.threads))
             ledger.add(rows_of(keys[name], stage, outcomes, space))
             last = ledger.cells[-len(outcomes)]
@@ -305,7 +244,7 @@ def main() -> None:
     options = tyro.cli(Options, description=__doc__).shortened()
     torch.set_num_threads(options.threads)
     cache, ledger = FitCache(options.cache), Ledger(options)
-    names = tuple(ABLATION) if options.ablation else options.methods
+    names = options.names()
     count = (len(options.scenes) + (options.capture is not None)) * len(options.seeds)
     plan = Plan(list(names) * count, dict.fromkeys(names, 40.0))
     begun = time.perf_counter()

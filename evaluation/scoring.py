@@ -62,6 +62,26 @@ class SceneScores:
         result["images_scored"] = sum(row["pixels"] > 0 for row in self.images)
         return result
 
+    def pooled(self, keys: Iterable[str]) -> dict[str, float | None]:
+        """Means in which every scored pixel counts alike, whichever view it is in (PSNR: of the pooled error).
+
+        For pixels cut to a coverage over all views at once: a mean over views would reward giving up whole views.
+        Views count by their scored pixels; None where no view has a value.
+        """
+        result: dict[str, float | None] = {}
+        for key in keys:
+            known = [(row[key], row["pixels"]) for row in self.images if row.get(key) is not None and row["pixels"]]
+            if not known:
+                result[key] = None
+                continue
+            values, weights = (np.array(column, dtype=np.float64) for column in zip(*known))
+            if key == "psnr":
+                error = float(np.average(10 ** (-values / 10), weights=weights))
+                result[key] = float(-10 * np.log10(error)) if error > 0 else float("inf")
+            else:
+                result[key] = float(np.average(values, weights=weights))
+        return result
+
 
 def score_scene(
     renders: Renders,

@@ -11,7 +11,8 @@ pytest.importorskip("torch")
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 PARTS = ("fit_cache", "trajectory_scenes", "trajectory_job", "trajectory_rivals", "trajectory_methods",
-         "trajectory_ablation", "trajectory_tables", "trajectory_page", "two_trajectory")  # fmt: skip
+         "trajectory_ablation", "trajectory_scores", "trajectory_tables", "trajectory_page",
+         "two_trajectory")  # fmt: skip
 
 
 @pytest.fixture
@@ -20,12 +21,20 @@ def bench(monkeypatch):
     return {name: importlib.import_module(name) for name in PARTS}
 
 
-def cell(method, scene, coverage, curve, **values):
-    points = [
-        {"coverage": c, "psnr": p, "ssim": None, "disparity_mae": None, "normal_mean_deg": None} for c, p in curve
-    ]
+def cell(method, scene, coverage, own, spread=None, photos=None, **values):
+    """A finished row; each curve is [(coverage, PSNR), …]."""
+    curves = {"own": own, "spread": spread or own, "photos": photos}
+    columns = {
+        order: {
+            "coverage": [c for c, _ in points],
+            "psnr": [p for _, p in points],
+            "disparity_mae": [None] * len(points),
+        }
+        for order, points in curves.items()
+        if points
+    }
     return {"table": "main", "scene": scene, "seed": 0, "method": method, "convention": "proper", "coverage": coverage,
-            "curve": points, **values}  # fmt: skip
+            "curves": columns, **values}  # fmt: skip
 
 
 def test_scores_at_equal_coverage_by_hand(bench):
@@ -33,41 +42,78 @@ def test_scores_at_equal_coverage_by_hand(bench):
         cell("field", "c", 0.8, [(0.8, 99.0)], psnr=99.0),  # not finished: bold is missing
         cell("pseudo-gt", "a", 0.1, [(0.1, 40.0)], psnr=40.0),  # the reference does not lower the bar
         cell("field", "a", 0.8, [(0.8, 18.0), (0.6, 20.0), (0.4, 21.0)], psnr=18.0),
-        cell("bold", "a", 0.5, [(0.5, 19.0), (0.4, 22.0)], psnr=19.0),
+        cell("bold", "a", 0.5, [(0.5, 19.0), (0.4, 22.0)], photos=[(0.5, 24.0)], psnr=19.0),
         cell("bold @ 0.9", "a", 0.2, [(0.2, 30.0)], psnr=30.0),  # another setting of a knob does not either
         cell("bold @ 0.9", "b", 0.2, [(0.2, 30.0)], psnr=30.0),
         cell("field", "b", 0.7, [(0.7, 10.0), (0.3, 14.0)], psnr=10.0),
-        cell("bold", "b", 0.3, [(0.3, 13.0)], psnr=None),
+        cell("bold", "b", 0.3, [(0.3, 13.0)], [(0.3, 11.0)], psnr=None, ause={"own": 0.5, "spread": 0.25}),
     ]
     rows = {row["method"]: row for row in bench["trajectory_tables"].summary_rows(cells)}
     # a: at .5, field is half way between 20 and 21; b: at .3, field has 14
     assert rows["field"]["psnr_at_coverage"] == pytest.approx((20.5 + 14.0) / 2)
     assert rows["bold"]["psnr_at_coverage"] == pytest.approx((19.0 + 13.0) / 2)
+    assert rows["bold"]["psnr_at_coverage_by_spread"] == pytest.approx((19.0 + 11.0) / 2)
+    assert rows["bold"]["psnr_at_coverage_at_best"] == pytest.approx((24.0 + 13.0) / 2)
+    assert rows["bold"]["psnr_at_coverage_by_photos"] == 24.0
+    assert (rows["bold"]["ause"], rows["bold"]["ause_by_spread"], rows["bold"]["ause_by_photos"]) == (0.5, 0.25, None)
     assert rows["field"]["at_coverage"] == pytest.approx(0.4)
     assert rows["field"]["psnr"] == pytest.approx(14.0)
     assert rows["bold"]["psnr"] == 19.0  # what is undefined is left out, never a NaN
     assert rows["pseudo-gt"]["psnr_at_coverage"] is None
     assert rows["field"]["psnr_at_0.4"] == pytest.approx((21.0 + 13.0) / 2)
     assert rows["field"]["ssim_at_coverage"] is None
+    assert rows["field"]["disparity_mae_at_coverage"] is None
     json.dumps(list(rows.values()), allow_nan=False)
     turned = cell("bold @ 0.5", "a", 0.6, [(0.6, 25.0), (0.4, 27.0)], psnr=25.0)
     other = cell("bold @ 0.5", "b", 0.2, [(0.2, 1.0)], psnr=1.0)
     rows = {row["method"]: row for row in bench["trajectory_tables"].summary_rows([*cells, turned, other])}
-    assert rows["bold"]["psnr_at_coverage"] == pytest.approx((26.0 + 13.0) / 2)  # at its best setting
+    assert rows["bold"]["psnr_at_coverage"] == pytest.approx((19.0 + 13.0) / 2)  # its own setting
+    assert rows["bold"]["psnr_at_coverage_at_best"] == pytest.approx((26.0 + 13.0) / 2)
     assert rows["field"]["psnr_at_coverage"] == pytest.approx((20.5 + 14.0) / 2)
+    apart = bench["trajectory_tables"].per_scene(cells, ("bold", "field"), "psnr_at_coverage")
+    assert apart == {"bold": {"a": 19.0, "b": 13.0}, "field": {"a": 20.5, "b": 14.0}}
+
+
+def test_a_run_with_less_coverage_than_curves_reach_counts_for_nobody(bench):
+    cells = [
+        cell("field", "a", 0.8, [(0.8, 18.0), (0.1, 21.0)]), cell("bold", "a", 0.05, [(0.05, 30.0)]),
+        cell("field", "b", 0.8, [(0.8, 18.0), (0.1, 20.0)]), cell("bold", "b", 0.1, [(0.1, 25.0)]),
+        cell("field", "c", 0.8, [(0.8, 18.0), (0.1, 20.0)]), cell("bold", "c", 0.0, []),
+    ]  # fmt: skip
+    rows = {row["method"]: row for row in bench["trajectory_tables"].summary_rows(cells)}
+    assert (rows["field"]["psnr_at_coverage"], rows["bold"]["psnr_at_coverage"]) == (20.0, 25.0)  # of b alone
+
+
+@pytest.mark.parametrize(
+    ("ours", "rival", "said"),
+    [
+        ((20.0, 22.0, 24.0), (19.0, 20.0, 23.5), "we win"),
+        ((19.0, 20.0, 23.5), (20.0, 22.0, 24.0), "we lose"),
+        ((20.0, 20.0, 26.0), (19.0, 21.0, 24.0), "we win, within chance"),
+        ((20.0, 22.0, 24.0), (20.0, 22.0, 24.0), "a tie"),
+    ],
+)
+def test_the_verdict_counts_scenes_not_means(bench, ours, rival, said):
+    page, cells = bench["trajectory_page"], []
+    for scene, first, second in zip("abc", ours, rival):
+        cells += [cell("clean", scene, 0.5, [(0.5, first)]), cell("field", scene, 0.5, [(0.5, second)])]
+    rows = bench["trajectory_tables"].summary_rows(cells)
+    (line,) = page.who_wins({"rows": rows, "cells": cells})
+    assert line.startswith(f"- **Masked PSNR at equal coverage: {said}.** Our best, `clean`, has")
+    assert "the best rival, `field`" in line
 
 
 @pytest.fixture
 def stage(bench, monkeypatch):
     """A tiny room and a barely trained field of it."""
-    scenes, main = bench["trajectory_scenes"], bench["two_trajectory"]
+    scenes = bench["trajectory_scenes"]
     monkeypatch.setattr(scenes, "POINTS", 4000)
     monkeypatch.setattr(scenes, "FEWEST_SEEN", 0.0)
     # a field that has hardly been trained puts everything far away
     monkeypatch.setattr(scenes.TrajectoryScene, "extent", scenes.SceneExtent(limit=60.0, unit=1.0))
     scene = scenes.synthetic_scene(2026, "room-1", photos=4, views=2, width=24, resolution=24)
     pseudo = scene.pseudo(lambda cameras: np.zeros(0))
-    return main.Stage(scene, pseudo, scene.truth(pseudo), 20, 2)
+    return bench["trajectory_scores"].Stage(scene, pseudo, scene.truth(pseudo), 20, 2)
 
 
 @pytest.mark.slow
@@ -75,8 +121,8 @@ def test_every_method_runs_and_a_run_goes_on_where_it_was_broken_off(bench, stag
     main, methods, rivals = bench["two_trajectory"], bench["trajectory_methods"], bench["trajectory_rivals"]
     monkeypatch.setattr(rivals, "FREE_POINTS", 500)
     monkeypatch.setattr(rivals, "SPARSITY_POINTS", 500)
-    monkeypatch.setattr(methods, "UNCERTAINTY_THRESHOLDS", (0.9, 1.0))
-    monkeypatch.setattr(methods, "STRENGTHS", (0.5,))
+    monkeypatch.setattr(methods, "UNCERTAINTY_THRESHOLDS", (1.0, 0.9))
+    monkeypatch.setattr(methods, "STRENGTHS", (0.5, 0.1))
     options = main.Options(seeds=(0,), fit_steps=8, steps=2, out=tmp_path, cache=tmp_path / "cache", threads=1)
     cache, ledger = main.FitCache(options.cache), main.Ledger(options)
 
@@ -87,9 +133,18 @@ def test_every_method_runs_and_a_run_goes_on_where_it_was_broken_off(bench, stag
     run(options, options.methods)
     done = {row["method"]: row for row in ledger.cells}
     assert set(options.methods) <= set(done)
-    assert done["bayes-rays @ 1"]["coverage"] >= done["bayes-rays"]["coverage"]
+    assert done["bayes-rays @ 0.9"]["coverage"] <= done["bayes-rays"]["coverage"]
     assert all(row["convention"] == "proper" for row in done.values())
     assert done["visibility"]["trained_steps"] == 2
+    assert done["dsds-restoration"]["seconds"] > 0 < done["dsds-restoration"]["cpu_seconds"]
+    assert done["fitted"]["coverage"] == done["bayes-rays"]["coverage"]
+    for method in options.methods:
+        curves = done[method]["curves"]
+        assert {"own", "spread", "photos"} == set(curves)
+        assert len({tuple(each["coverage"]) for each in curves.values()}) == 1
+        own = ("bayes-rays", "clean", "visibility+clean", "dsds-restoration")
+        assert (curves["own"] != curves["spread"]) == (method in own)
+    assert {"own", "spread"} == set(done["bayes-rays @ 0.9"]["curves"])
     assert done["clean"]["trained_steps"] == 0
     stored = json.loads((tmp_path / "two_trajectory.json").read_text())
     assert {row["method"] for row in stored["rows"]} == set(done)
@@ -99,7 +154,7 @@ def test_every_method_runs_and_a_run_goes_on_where_it_was_broken_off(bench, stag
     bench["trajectory_page"].main()
     assert (tmp_path / "two_trajectory.png").stat().st_size > 10_000
     text = (tmp_path / "README.md").read_text()
-    assert "we win" in text or "we lose" in text
+    assert "Masked PSNR at equal coverage" in text
     assert "| room-1 | 4 | 2 |" in text  # the scene and its photos
     assert all(f"| {method} |" in text for method in options.methods)
 
@@ -121,9 +176,20 @@ def test_the_ablation_and_equal_seconds_run(bench, stage, tmp_path, monkeypatch)
     assert {row["method"] for row in ledger.cells} == set(table)
     assert {row["table"] for row in ledger.cells} == {"ablation"}
 
-    seconds = main.Options(seeds=(0,), methods=("field",), out=tmp_path, cache=tmp_path / "c", equal_seconds=True)
+    wanted = ("pseudo-gt", "fitted", "field", "bayes-rays")
+    seconds = main.Options(seeds=(0,), fit_steps=8, methods=wanted, out=tmp_path, cache=tmp_path / "c", threads=1,
+                           equal_seconds=True)  # fmt: skip
+    assert seconds.names() == ("field",)
     with pytest.raises(ValueError, match="do the main table of room-1 first"):
         main.run_stage(seconds, stage, cache, main.Ledger(seconds), main.Plan(["field"], {"field": 1.0}))
+    ledger = main.Ledger(seconds)
+    took = [{"table": "main", "scene": "room-1", "seed": seed, "method": "visibility", "convention": "proper",
+             "coverage": 0.5, "seconds": each} for seed, each in enumerate((0.2, 0.4, 9.0))]  # fmt: skip
+    ledger.cells += took
+    main.run_stage(seconds, stage, cache, ledger, main.Plan(["field"], {"field": 1.0}))
+    found = ledger.cells[-1]
+    assert (found["table"], found["method"]) == ("equal seconds", "field")
+    assert 0.3 < found["seconds"] < 3.0  # the median, and the step that was under way
 
 
 def test_scenes_are_named_by_what_they_are(bench):

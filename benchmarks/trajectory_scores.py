@@ -1,0 +1,124 @@
+"""What a row of the two-trajectory benchmark says of one setting of a method: scores, curves over coverage, labels.
+
+A method gives up pixels in one of three orders: ``own``, by the method's own uncertainty; ``spread``, by how far the
+depth along the ray spreads, which any field can tell; ``photos``, by :func:`unghost.regularizer.photo_doubt`, which
+any field with the photos it was trained on can tell. A method without an uncertainty of its own has ``spread`` as own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from trajectory_job import Outcome, Views, render
+from trajectory_scenes import LabelledSpace, TrajectoryScene
+
+from unghost.evaluation.conventions import evaluation_masks, get_convention
+from unghost.evaluation.curves import cut_to_coverage
+from unghost.evaluation.pseudo import PseudoTruth
+from unghost.evaluation.scoring import SceneScores, score_scene, score_under_all
+from unghost.evaluation.sparsification import sparsify
+from unghost.evaluation.views import Renders, Truth
+from unghost.regularizer.photo_doubt import mean_rank, photo_doubt
+
+CONVENTION = "proper"
+COVERAGES = (0.02, 0.05, *(round(0.05 * step, 2) for step in range(2, 20)))
+CURVE_KEYS = ("psnr", "ssim", "disparity_mae", "normal_mean_deg")
+SLACK = 2.0  # cells of the field behind its depth that a photo still sees
+DIGITS = 4  # of a curve's numbers
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """One scene with the truth about it."""
+
+    scene: TrajectoryScene
+    pseudo: PseudoTruth
+    truth: Truth
+    fit_steps: int
+    steps: int
+
+
+def scored(
+    stage: Stage, outcome: Outcome, space: LabelledSpace | None, *, conventions: bool = False, headline: bool = True
+) -> dict[str, Any]:
+    """All that a row says.
+
+    Args:
+        stage: the scene.
+        outcome: one setting of a method.
+        space: its labels; None for a capture.
+        conventions: scores under every published one, too.
+        headline: the setting that stands in the tables, which is cut in all orders; False: in its own and by spread.
+    """
+    scene = stage.scene
+    views = render(outcome, scene, scene.evaluation.cameras)
+    renders = Renders(np.clip(views["rgb"], 0, 1), views["depth"], np.clip(views["accumulation"], 0, 1))
+    extent = scene.extent
+    scores = score_scene(renders, stage.truth, extent, convention=CONVENTION)
+    mask = evaluation_masks(get_convention(CONVENTION), renders, stage.truth, extent)
+    row = {"convention": CONVENTION, **scores.means(), "psnr_visible": _psnr_visible(renders, stage.truth)}
+    row["curves"], row["ause"] = {}, {}
+    for name, doubt in _doubts(stage, outcome, views, renders, mask, headline).items():
+        row["curves"][name] = _curve(stage, renders, mask, doubt, scores)
+        row["ause"][name] = _ause(views["depth"], stage.pseudo.depth, doubt, mask)
+    if conventions:
+        under = score_under_all(renders, stage.truth, extent)
+        row["conventions"] = {name: each.means() for name, each in under.items() if each.images}
+    if space is not None:
+        row |= space.scores(outcome.field)
+    return {**row, "seconds": outcome.seconds, "cpu_seconds": outcome.cpu_seconds, "trained_steps": outcome.steps,
+            "knob": outcome.knob, "note": outcome.note}  # fmt: skip
+
+
+def _doubts(
+    stage: Stage, outcome: Outcome, views: Views, renders: Renders, mask: NDArray[np.bool_], headline: bool
+) -> dict[str, NDArray[Any]]:
+    """Order -> uncertainty of every pixel."""
+    found = {"own": views["spread"], "spread": views["spread"]}
+    if outcome.uncertainty is not None:
+        found["own"] = views["uncertainty"]
+    if headline or outcome.asks_photos:
+        told = stage.scene.train
+        found["photos"] = photo_doubt(
+            renders.colours, views["depth"], stage.scene.evaluation.cameras, photos=told.photos,
+            photo_depth=render(outcome, stage.scene, told.cameras, values=False)["depth"], photo_cameras=told.cameras,
+            slack=SLACK * outcome.field.field_pitch,
+        )  # fmt: skip
+    if outcome.asks_photos:
+        found["own"] = mean_rank(found["photos"], found["own"], within=mask)
+    return found
+
+
+def _curve(
+    stage: Stage, renders: Renders, mask: NDArray[np.bool_], doubt: NDArray[Any], whole: SceneScores
+) -> dict[str, list[float | None]]:
+    """Scores of the surest pixels, as many as each coverage asks for; every pixel counts alike."""
+    covered = float(mask.mean())
+    points = [{"coverage": covered, **whole.pooled(CURVE_KEYS)}]
+    for coverage in (each for each in COVERAGES if each < covered):
+        cut = cut_to_coverage(mask, -doubt, coverage=coverage)
+        point = score_scene(
+            renders, stage.truth, stage.scene.extent, convention=CONVENTION, within=cut, keys=CURVE_KEYS
+        )
+        points.append({"coverage": coverage, **point.pooled(CURVE_KEYS)})
+    return {key: [None if point[key] is None else round(point[key], DIGITS) for point in points] for key in points[0]}
+
+
+def _psnr_visible(renders: Renders, truth: Truth) -> float | None:
+    """Of all pixels that a training photo saw, whatever is rendered there: nothing can be gained by removing."""
+    errors = np.mean((renders.colours.astype(np.float64) - truth.photos) ** 2, axis=-1)
+    assert truth.visible is not None
+    values = [-10 * np.log10(error[seen].mean()) for error, seen in zip(errors, truth.visible) if seen.any()]
+    return float(np.mean(values)) if values else None
+
+
+def _ause(depth: NDArray[Any], true: NDArray[Any], doubt: NDArray[Any], mask: NDArray[np.bool_]) -> float | None:
+    """How well an uncertainty ranks errors of depth: area under the sparsification error curve, 0 is best."""
+    both = mask & np.isfinite(true)
+    if not both.any():
+        return None
+    error = np.abs(np.where(both, depth, 0.0) - np.where(both, true, 0.0))
+    return sparsify(error, doubt, both).ause
