@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -41,36 +41,6 @@ class Weights:
 
 
 @dataclass(frozen=True, eq=False)
-class Job:
-    """A trained field, and how long it may be improved.
-
-    Attributes:
-        scene: what it is of.
-        base: the field; not to be changed.
-        seed: of rays and cubes.
-        steps: of those that train.
-        seconds: instead of steps; None: steps.
-        cubes: a step.
-        threads: of the denoiser.
-        weights: of the rivals' losses.
-    """
-
-    scene: TrajectoryScene
-    base: Any
-    seed: int
-    steps: int
-    seconds: float | None = None
-    cubes: int = 12
-    threads: int = 2
-    weights: Weights = Weights()
-
-    @property
-    def fitting(self) -> TrainingConfig:
-        """As the field was fitted."""
-        return TrainingConfig(rays=self.scene.rays, sampling=self.scene.sampling)
-
-
-@dataclass(frozen=True, eq=False)
 class Outcome:
     """One setting of a method.
 
@@ -95,6 +65,38 @@ class Outcome:
     background_uncertainty: float = 0.0
     asks_photos: bool = False
     note: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """A trained field, and how long it may be improved.
+
+    Attributes:
+        scene: what it is of.
+        base: the field; not to be changed.
+        seed: of rays and cubes.
+        steps: of those that train.
+        seconds: instead of steps; None: steps.
+        cubes: a step.
+        threads: of the denoiser.
+        weights: of the rivals' losses.
+        done: outcomes that another method of the same job goes on from.
+    """
+
+    scene: TrajectoryScene
+    base: Any
+    seed: int
+    steps: int
+    seconds: float | None = None
+    cubes: int = 12
+    threads: int = 2
+    weights: Weights = Weights()
+    done: dict[str, Outcome] = field(default_factory=dict)
+
+    @property
+    def fitting(self) -> TrainingConfig:
+        """As the field was fitted."""
+        return TrainingConfig(rays=self.scene.rays, sampling=self.scene.sampling)
 
 
 class Clock:

@@ -104,7 +104,10 @@ def _curve(
             renders, stage.truth, stage.scene.extent, convention=CONVENTION, within=cut, keys=CURVE_KEYS
         )
         points.append({"coverage": coverage, **point.pooled(CURVE_KEYS)})
-    return {key: [None if point[key] is None else round(point[key], DIGITS) for point in points] for key in points[0]}
+    columns = {key: [point[key] for point in points] for key in points[0]}
+    for key in CURVE_KEYS:  # not the coverage: the bar is exactly one of them
+        columns[key] = [None if value is None else round(value, DIGITS) for value in columns[key]]
+    return columns
 
 
 def _psnr_visible(renders: Renders, truth: Truth) -> float | None:

@@ -137,10 +137,11 @@ def _at_equal_coverage(cells: Sequence[Cell]) -> dict[tuple[Any, str], dict[str,
         reached = [score_at(mine, cell, "psnr", lowest, "spread") for cell in compared]
         if not lowest or any(value is None for value in reached):
             continue
+        turned = any("@" in cell["method"] for cell in mine)  # knobs are, on the first seed
         for cell in mine:
             found: dict[str, float | None] = {
                 f"{key}_at_coverage{name}": score_at(mine, cell, key, lowest, order)
-                for key in AT_EQUAL for name, order in ORDERS.items()
+                for key in AT_EQUAL for name, order in ORDERS.items() if order is not None or turned
             }  # fmt: skip
             result[run, cell["method"]] = {"coverage": lowest, **found}
     return result

@@ -218,22 +218,25 @@ def run_stage(options: Options, stage: Stage, cache: FitCache, ledger: Ledger, p
     names = options.names()
     for seed in options.seeds:
         keys = {name: ledger.key(scene.name, seed, name, stage.steps) for name in names}
-        base: RadianceField | None = None
+        job: Job | None = None
         space: LabelledSpace | None = None
         for name in names:
             plan.begin(name, f"{scene.name}, seed {seed}, {name}")
             if ledger.has(keys[name]):
                 continue
-            if base is None:
+            if job is None:
                 base, _ = fitted(options, cache, "field", scene, scene.train, seed, stage.fit_steps)
+                budget = ledger.seconds_of(scene.name, "visibility") if options.equal_seconds else None
+                job = Job(scene, base, seed, stage.steps, budget, threads=options.threads)
                 space = LabelledSpace(scene, base, seed) if scene.photographed is not None else None
             if name == "pseudo-gt":
                 both = scene.train.joined(scene.evaluation)
                 better, seconds = fitted(options, cache, "pseudo", scene, both, seed, stage.fit_steps)
                 outcomes = [Outcome(better, seconds)]
             else:
-                budget = ledger.seconds_of(scene.name, "visibility") if options.equal_seconds else None
-                outcomes = table[name](Job(scene, base, seed, stage.steps, budget, threads=options.threads))
+                outcomes = table[name](job)
+            if seed != options.seeds[0]:  # other settings of a knob are looked at once
+                outcomes = outcomes[:1]
             ledger.add(rows_of(keys[name], stage, outcomes, space))
             last = ledger.cells[-len(outcomes)]
             say("    " + " ".join(f"{key} {last[key]:.3f}" for key in ("psnr", "disparity_mae", "coverage", "seconds")

@@ -147,6 +147,7 @@ def test_every_method_runs_and_a_run_goes_on_where_it_was_broken_off(bench, stag
     assert {"own", "spread"} == set(done["bayes-rays @ 0.9"]["curves"])
     assert done["clean"]["trained_steps"] == 0
     stored = json.loads((tmp_path / "two_trajectory.json").read_text())
+    assert all(done[method]["curves"]["own"]["coverage"][0] == done[method]["coverage"] for method in options.methods)
     assert {row["method"] for row in stored["rows"]} == set(done)
     assert "NaN" not in (tmp_path / "two_trajectory.json").read_text()
     assert done["field"]["coverage"] > 0.1
