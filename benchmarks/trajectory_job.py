@@ -27,10 +27,9 @@ Term = Callable[[Any, int], Tensor]
 
 @dataclass(frozen=True)
 class Weights:
-    """Factors of the rivals' losses, chosen on a development scene (``trajectory_sweep.py``).
+    """Factors of the rivals' losses, chosen on development scenes (``trajectory_sweep.py``).
 
-    Each is the one with the smallest disparity error of those whose PSNR at equal coverage is within .1 dB of the best;
-    for the distortion loss and the free-space prior, whose factors differ by more, the best PSNR.
+    One rule for all: the smallest disparity error of those whose PSNR at equal coverage is within .1 dB of the best.
     """
 
     sparsity: float = 1e-3

@@ -36,13 +36,23 @@ def _with(*makers: Callable[[Job], Term]) -> Callable[[Job], list[Outcome]]:
 
 
 def _distortion(job: Job) -> list[Outcome]:
-    config = dataclasses.replace(job.fitting, distortion_weight=job.weights.distortion)
-    return [fine_tuned(job, visibility, config=config)]
+    return [fine_tuned(job, visibility, config=_distorting(job))]
+
+
+def _distorting(job: Job) -> Any:
+    return dataclasses.replace(job.fitting, distortion_weight=job.weights.distortion)
+
+
+def _dsds_and_distortion(job: Job) -> list[Outcome]:
+    return _with_doubt(job, fine_tuned(job, make_regularizer, config=_distorting(job)))
 
 
 def restoration(job: Job, **over: Any) -> list[Outcome]:
     """Trained with DSDS; what stays is doubted by the prior and by the photos."""
-    tuned = fine_tuned(job, lambda job: make_regularizer(job, **over))
+    return _with_doubt(job, fine_tuned(job, lambda job: make_regularizer(job, **over)))
+
+
+def _with_doubt(job: Job, tuned: Outcome) -> list[Outcome]:
     clock = Clock()
     doubted = _doubted(_judged(job, tuned.field))
     return [dataclasses.replace(tuned, **_sum(tuned, clock), **doubted)]
@@ -120,24 +130,28 @@ def cleaned(job: Job, base: Any, *, strengths: tuple[float, ...] = STRENGTHS) ->
             for strength, mask in masks.items()]  # fmt: skip
 
 
-def _with_visibility(job: Job) -> Outcome:
-    """Trained once a job."""
-    if "visibility" not in job.done:
-        job.done["visibility"] = fine_tuned(job, visibility)
-    return job.done["visibility"]
+def once(job: Job, name: str) -> Outcome:
+    """What a method makes of the field, trained once a job."""
+    if name not in job.done:
+        make = {"visibility": lambda: fine_tuned(job, visibility), "dsds-restoration": lambda: restoration(job)[0]}
+        job.done[name] = make[name]()
+    return job.done[name]
 
 
-def _clean_after_visibility(job: Job) -> list[Outcome]:
-    tuned = _with_visibility(job)
-    clock = Clock()
-    (found,) = cleaned(job, tuned.field, strengths=STRENGTHS[:1])
-    return [dataclasses.replace(found, **_sum(tuned, clock), steps=tuned.steps, knob=None)]
+def _clean_after(name: str) -> Callable[[Job], list[Outcome]]:
+    def method(job: Job) -> list[Outcome]:
+        tuned = once(job, name)
+        clock = Clock()
+        (found,) = cleaned(job, tuned.field, strengths=STRENGTHS[:1])
+        return [dataclasses.replace(found, **_sum(tuned, clock), steps=tuned.steps, knob=None)]
+
+    return method
 
 
 METHODS: dict[str, Callable[[Job], list[Outcome]]] = {
     "fitted": lambda job: [Outcome(job.base, 0.0)],
     "field": lambda job: [fine_tuned(job)],
-    "visibility": lambda job: [_with_visibility(job)],
+    "visibility": lambda job: [once(job, "visibility")],
     "visibility+sparsity": _with(sparsity),
     "visibility+tv": _with(total_variation),
     "visibility+regnerf": _with(regnerf),
@@ -146,8 +160,10 @@ METHODS: dict[str, Callable[[Job], list[Outcome]]] = {
     "bayes-rays": _bayes_rays,
     "components": _components,
     "dsds-paper": paper,
-    "dsds-restoration": restoration,
+    "dsds-restoration": lambda job: [once(job, "dsds-restoration")],
+    "dsds-restoration+distortion": _dsds_and_distortion,
     "clean": lambda job: cleaned(job, job.base),
-    "visibility+clean": _clean_after_visibility,
+    "visibility+clean": _clean_after("visibility"),
+    "dsds-restoration+clean": _clean_after("dsds-restoration"),
 }
 UNTRAINED = ("fitted", "bayes-rays", "components", "clean")  # equal seconds say nothing of them

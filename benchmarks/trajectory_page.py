@@ -18,7 +18,7 @@ from unghost.evaluation.intervals import Interval, bootstrap_difference
 from unghost.evaluation.report import convention_rows
 
 ROOT = Path(__file__).resolve().parents[1]
-OURS = ("dsds-restoration", "clean", "visibility+clean")
+OURS = ("dsds-restoration", "dsds-restoration+distortion", "clean", "visibility+clean", "dsds-restoration+clean")
 WATCHED = (*OURS, "bayes-rays", "visibility", "field")
 RESAMPLES = 2000
 PLAIN = {
@@ -97,7 +97,7 @@ def page(results: dict[str, Any]) -> str:
         "intervals of a bootstrap over scenes).", "",
         "**Equal coverage.** Whoever removes more is scored on easier pixels. So every method is cut to the lowest "
         "coverage among all of them on that scene, giving up first the pixels of which it is least sure: `bayes-rays` "
-        "by its own uncertainty; `clean`, `visibility+clean` and `dsds-restoration` by the prior's doubt and by "
+        "by its own uncertainty; `clean` and `dsds-restoration`, alone or with others, by the prior's doubt and by "
         "whether the training photos bear out the colour (`photo_doubt`; the mean of both ranks); whoever has no such "
         "thing by how far the depth along the ray spreads. All kept pixels of a scene count alike.", "",
         "## In plain words", "", *who_wins(results), "",

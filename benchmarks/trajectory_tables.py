@@ -35,8 +35,10 @@ COLORS = {
     "visibility+distortion": "#9467bd", "free-space": "#e7ba52",
     "bayes-rays": "#2ca02c", "components": "#8c564b", "dsds-paper": "#f7b6d2",
     "dsds-restoration": "#d62728", "clean": "#ff7f0e", "visibility+clean": "#ffbb78",
+    "dsds-restoration+distortion": "#8b0000", "dsds-restoration+clean": "#ff9896",
 }  # fmt: skip
-STRONG = ("field", "visibility", "visibility+distortion", "bayes-rays", "dsds-restoration", "clean")
+STRONG = ("visibility", "visibility+distortion", "bayes-rays", "dsds-restoration", "dsds-restoration+distortion",
+          "clean")  # fmt: skip
 Cell = dict[str, Any]
 
 
