@@ -65,7 +65,7 @@ def read_method(name: str, folder: str | Path, views: Sequence[str], shape: tupl
     source = Path(folder)
     found = _pictures(source, skip=MAPS)
     paths = [found[key] for key in match_names("renders", list(found), views, where=str(source))]
-    maps = {key: _one_map(source, key, views, shape) for key in MAPS}
+    maps = {key: read_map(source, key, views, shape) for key in MAPS}
     colours = _stack(paths, shape)
     both = [key for key in KNOBS if maps[key] is not None]
     if len(both) > 1:
@@ -126,6 +126,34 @@ def read_masks(folder: str | Path, views: Sequence[str], shape: tuple[int, int])
     return np.asarray(_stack([found[key] for key in keys], shape).mean(axis=-1) >= 0.5, dtype=np.bool_)
 
 
+def read_map(folder: str | Path, key: str, views: Sequence[str], shape: tuple[int, int]) -> Any:
+    """One kind of map of the views, without their pictures: ``(n, H, W)`` (normals: ``(n, H, W, 3)``), or None.
+
+    Args:
+        folder: of the renders.
+        key: one of ``MAPS``.
+        views, shape: as in :func:`read_method`.
+
+    Raises:
+        ValueError: maps of views that are missing, of another shape, or not floating point.
+    """
+    below, archive = Path(folder) / key, Path(folder) / ARCHIVE
+    wanted = (*shape, 3) if key == "normals" else shape
+    if archive.is_file():
+        names, values = _archive(archive, key)
+        if values is not None:
+            chosen = match_names(f"{key} maps", names, views, where=str(archive), whole=False)
+            position = {name: index for index, name in enumerate(names)}
+            return _checked(f"{key} in {archive}", values[[position[name] for name in chosen]], wanted)
+    if not below.is_dir():
+        return None
+    found = {path.relative_to(below).with_suffix("").as_posix(): path for path in sorted(below.rglob("*.npy"))}
+    if not found:
+        return None  # pictures for people
+    chosen = match_names(f"{key} maps", list(found), views, where=str(below), whole=False)
+    return np.stack([_checked(str(found[name]), _load(found[name])[None], wanted)[0] for name in chosen])
+
+
 def match_names(
     what: str, given: Sequence[str], views: Sequence[str], *, where: str, whole: bool = True
 ) -> tuple[str, ...]:
@@ -184,25 +212,6 @@ def _pictures(folder: Path, skip: Sequence[str] = ()) -> dict[str, Path]:
     if not found:
         raise ValueError(f"{folder} holds no pictures ({', '.join(PICTURES)})")
     return found
-
-
-def _one_map(folder: Path, key: str, views: Sequence[str], shape: tuple[int, int]) -> Any:
-    """``(n, H, W)`` (normals: ``(n, H, W, 3)``) of one kind of map, or None."""
-    below, archive = folder / key, folder / ARCHIVE
-    wanted = (*shape, 3) if key == "normals" else shape
-    if archive.is_file():
-        names, values = _archive(archive, key)
-        if values is not None:
-            chosen = match_names(f"{key} maps", names, views, where=str(archive), whole=False)
-            position = {name: index for index, name in enumerate(names)}
-            return _checked(f"{key} in {archive}", values[[position[name] for name in chosen]], wanted)
-    if not below.is_dir():
-        return None
-    found = {path.relative_to(below).with_suffix("").as_posix(): path for path in sorted(below.rglob("*.npy"))}
-    if not found:
-        return None  # pictures for people
-    chosen = match_names(f"{key} maps", list(found), views, where=str(below), whole=False)
-    return np.stack([_checked(str(found[name]), _load(found[name])[None], wanted)[0] for name in chosen])
 
 
 def _archive(path: Path, key: str) -> tuple[list[str], Any]:

@@ -1,0 +1,88 @@
+"""The verb that says which pixels of anyone's renders the training photos contradict."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+from tyro.conf import Positional
+
+KIND = "uncertainty"
+
+
+def doubt(
+    renders: Positional[Path], gt: Path, train_renders: Path, eval_split: str = "eval", train_split: str = "train",
+    downscale: float = 1.0, depth_along: Literal["ray", "axis"] = "ray", normalize: bool = True,
+    tolerance: float = 0.05, replace: bool = False,
+) -> None:  # fmt: skip
+    """Say which pixels not to trust, by the photos that were trained on; needs renders with depth, but no field.
+
+    Writes RENDERS/uncertainty, a .npy a view (0: the photos bear the colour out, 1: no photo sees the point) and a
+    picture for people. `unghost evaluate` then scores the method as a curve over coverage.
+
+    Args:
+        renders: folder of the evaluation views: colour pictures, and depth maps in depth/ or maps.npz.
+        gt: a capture (transforms.json): the photos and all cameras.
+        train_renders: folder with the depth maps of the training views, rendered by the same field.
+        eval_split: the sweep that was rendered.
+        train_split: the sweep that was trained on.
+        downscale: photo pixels per pixel of the renders, along each axis.
+        depth_along: what the depths are measured along: the pixel's ray, or the camera's optical axis.
+        normalize: the depths are in units in which the farthest camera coordinate is 1, not the file's.
+        tolerance: relative: how far behind a photo's depth a point is still seen by it.
+        replace: uncertainty maps that are there already.
+    """
+    import numpy as np
+
+    from .evaluation.captures import load_capture
+    from .evaluation.protocol import ray_depth
+    from .evaluation.renders_folder import read_map, read_method
+    from .regularizer.photo_doubt import UNSEEN, photo_doubt
+
+    capture = load_capture(gt, downscale=downscale, normalize=normalize)
+    views, taught = capture.split(eval_split), capture.split(train_split)
+    names, photo_names = ([capture.names[index] for index in part] for part in (views, taught))
+    cameras, photo_cameras = capture.cameras.select(views), capture.cameras.select(taught)
+    shape = cameras.height, cameras.width
+    _check_free(renders, replace)
+    method = read_method(renders.resolve().name, renders, names, shape)
+    depth = _there(method.renders.depth, renders)
+    photo_depth = _there(read_map(train_renders, "depth", photo_names, shape), train_renders)
+    if depth_along == "axis":
+        depth, photo_depth = ray_depth(depth, cameras), ray_depth(photo_depth, photo_cameras)
+    found = photo_doubt(
+        method.renders.colours, depth, cameras, photos=capture.images(taught), photo_depth=photo_depth,
+        photo_cameras=photo_cameras, tolerance=tolerance,
+    )  # fmt: skip
+    short = [Path(name).name for name in names]
+    for name, values in zip(short if len(set(short)) == len(short) else names, found):
+        _write((renders / KIND / name).with_suffix(".npy"), values)
+    seen = found[found < UNSEEN]
+    colours = f"; colours off by {np.median(seen):.3f} in the median where one does" if seen.size else ""
+    print(f"{len(names)} views, {len(photo_names)} photos: {seen.size / found.size:.3f} of the pixels show what one of "
+          f"them sees{colours}\n{renders / KIND}")  # fmt: skip
+
+
+def _there(depth: Any, folder: Path) -> Any:
+    if depth is None:
+        raise ValueError(f"doubt: {folder} holds no depth maps (depth/NAME.npy, or maps.npz with depth)")
+    return depth
+
+
+def _check_free(renders: Path, replace: bool) -> None:
+    """Somebody's own uncertainties are not written over."""
+    for kind in ("confidence", KIND):
+        folder = renders / kind
+        if folder.is_dir() and any(folder.iterdir()) and (kind != KIND or not replace):
+            advice = "say --replace" if kind == KIND else "move it away"
+            raise ValueError(f"doubt: {folder} is there already; {advice}")
+
+
+def _write(path: Path, values: Any) -> None:
+    import numpy as np
+    from PIL import Image
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.save(path, values)
+    bright = np.round(255 * np.sqrt(np.clip(values, 0, 1))).astype(np.uint8)  # small differences are to be seen
+    Image.fromarray(bright).save(path.with_suffix(".png"))
