@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+import tempfile
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -67,7 +69,19 @@ def make_capture(
                 f"{sizes['eval']}; record both alike, or resize one"
             )
         names = {sweep: [path.name for path in found.paths] for sweep, found in taken.items()}
-        posing = pose_jointly(images, names, out=partial / MODEL, settings=how, progress=progress)
+        try:
+            posing = pose_jointly(images, names, out=partial / MODEL, settings=how, progress=progress)
+        except ValueError as error:
+            kept = {
+                source: _keep_frames(images, names[sweep], Path(f"{out}.{sweep}"))
+                for sweep, source in sources.items() if source.is_file()
+            }  # fmt: skip
+            if not kept:
+                raise
+            said = " and ".join(f"those of {source} in {folder}" for source, folder in kept.items())
+            raise ValueError(
+                f"{error}; the frames are kept, {said}: a folder can be given in a video's place"
+            ) from None
         sweeps = {sweep: [f"images/{name}" for name in found] for sweep, found in posing.posed.items()}
         capture = load_capture(partial, downscale=1, normalize=False, splits=sweeps)
         write_transforms(
@@ -78,6 +92,14 @@ def make_capture(
         told = _told(sources, taken, posing, how)
         (partial / "capture.json").write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
     return told
+
+
+def _keep_frames(images: Path, names: list[str], beside: Path) -> Path:
+    """Move the frames of a video, minutes of work, into a new folder."""
+    kept = Path(tempfile.mkdtemp(prefix=f"{beside.name}.", dir=beside.parent))
+    for name in names:
+        shutil.move(images / name, kept / name)
+    return kept
 
 
 def _told(

@@ -23,7 +23,7 @@ from .checks import Mask
 from .conventions import SceneExtent
 from .geometry import normals_from_depth
 from .protocol import view_counts
-from .views import Truth, check_depth
+from .views import Truth, check_depth, check_normals
 
 FORMAT = "unghost-pseudo-gt"
 FORMAT_VERSION = 1
@@ -187,10 +187,18 @@ def load_pseudo_truth(
         raise ValueError(
             f"load_pseudo_truth: {source} is inconsistent: depth_limit {stated} for cameras of {result.extent.limit}"
         )
-    for side, wanted in (("eval", eval_cameras), ("train", train_cameras)):
-        if wanted is not None:
-            _check_cameras(source, side, lenses[side], wanted)
+    check_cameras(source, result, eval_cameras=eval_cameras, train_cameras=train_cameras)
     return result
+
+
+def check_cameras(
+    source: Path, stored: PseudoTruth, *, eval_cameras: Cameras | None = None, train_cameras: Cameras | None = None
+) -> None:
+    """Refuse maps that are of other cameras than those given: size, poses, intrinsics, distortion to a millionth."""
+    pairs = (("eval", stored.eval_cameras, eval_cameras), ("train", stored.train_cameras, train_cameras))
+    for side, there, wanted in pairs:
+        if wanted is not None:
+            _check_cameras(source, side, there, wanted)
 
 
 def _read(source: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
@@ -241,10 +249,7 @@ def _check(caller: str, maps: PseudoTruth) -> None:
         if values is not None and values.shape != each:
             raise ValueError(f"{caller}: {name} must have shape {each}, got {values.shape}")
     check_depth(caller, "depth", maps.depth)
-    length = np.linalg.norm(maps.normals, axis=-1)
-    bad = int((np.abs(length[np.isfinite(length)] - 1) > 1e-3).sum())
-    if bad or np.isinf(maps.normals).any():
-        raise ValueError(f"{caller}: normals must be unit vectors or NaN, {bad} are not")
+    check_normals(caller, "normals", maps.normals)
     if len(maps.names) != shape[0] or len(set(maps.names)) != shape[0]:
         raise ValueError(f"{caller}: names must be {shape[0]} different ones, got {list(maps.names)}")
     if (maps.tolerance is None) != (maps.seen_open is None):

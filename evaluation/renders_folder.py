@@ -6,13 +6,16 @@ A folder of renders holds a colour image a view, and beside them what else was r
     renders/depth/frame_1_00001.npy …     (H, W) a view; so, too, accumulation, uncertainty or confidence, and normals
     renders/maps.npz                      or all views at once: "names" (n,) and "depth" (n, H, W) and so on
 
+What ``ns-render dataset`` writes is read, too: pictures in ``rgb``, maps of shape (H, W, 1) in ``raw-depth/….npy.gz``.
 Pictures belong together by their path within the folder, without its ending; or, where that does not work out for
 all of them, by their file names alone. Whatever does not match is reported together, before any picture is read.
 """
 
 from __future__ import annotations
 
+import gzip
 import zipfile
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -29,6 +32,7 @@ EIGHT_BITS = ("RGB", "L", "P", "RGBA", "LA", "PA", "1")
 KNOBS = ("confidence", "uncertainty")
 MAPS = ("depth", "accumulation", "normals", *KNOBS)
 ARCHIVE = "maps.npz"
+COLORS, RAW, PACKED = "rgb", "raw-", ".npy.gz"  # nerfstudio's
 NAMED = 3  # of those that do not match, in a message
 
 
@@ -63,7 +67,7 @@ def read_method(name: str, folder: str | Path, views: Sequence[str], shape: tupl
             hold values that cannot be: NaN depth (counted).
     """
     source = Path(folder)
-    found = _pictures(source, skip=MAPS)
+    found = _pictures(source / COLORS if (source / COLORS).is_dir() else source, skip=MAPS)
     paths = [found[key] for key in match_names("renders", list(found), views, where=str(source))]
     maps = {key: read_map(source, key, views, shape) for key in MAPS}
     colours = _stack(paths, shape)
@@ -116,12 +120,22 @@ def read_photos(
 def read_masks(folder: str | Path, views: Sequence[str], shape: tuple[int, int]) -> Mask:
     """White-on-black mask pictures, a view each: ``(n, H, W)`` bool, from half of white on a pixel counts.
 
-    ``images_a.png.mask.png``, as ``unghost masks`` names them, belongs to view ``images/a.png``.
+    ``images_a.png.mask.png``, as ``unghost masks`` names them, belongs to view ``images/a.png``, or, of a folder of
+    photos, to ``a``.
+
+    Raises:
+        ValueError: masks that are missing, or two of one view.
     """
     source = Path(folder)
-    flat = {view.replace("/", "_"): view for view in views}
-    plain = {key.removesuffix(".mask"): path for key, path in _pictures(source).items()}
-    found = {_stem(flat.get(key, key)): path for key, path in plain.items()}
+    flat = {_stem(view).replace("/", "_"): _stem(view) for view in views}
+    found: dict[str, Path] = {}
+    for key, path in _pictures(source).items():
+        stem = _stem(key.removesuffix(".mask"))
+        ends = [each for each in flat if stem == each or stem.endswith(f"_{each}")]
+        view = flat[max(ends, key=len)] if ends and stem not in flat.values() else stem
+        if view in found:
+            raise ValueError(f"{source} has two masks of {view}: {found[view].name} and {path.name}")
+        found[view] = path
     keys = match_names("masks", list(found), views, where=str(source), whole=False)
     return np.asarray(_stack([found[key] for key in keys], shape).mean(axis=-1) >= 0.5, dtype=np.bool_)
 
@@ -145,9 +159,11 @@ def read_map(folder: str | Path, key: str, views: Sequence[str], shape: tuple[in
             chosen = match_names(f"{key} maps", names, views, where=str(archive), whole=False)
             position = {name: index for index, name in enumerate(names)}
             return _checked(f"{key} in {archive}", values[[position[name] for name in chosen]], wanted)
+    below = below if below.is_dir() else below.with_name(RAW + key)
     if not below.is_dir():
         return None
-    found = {path.relative_to(below).with_suffix("").as_posix(): path for path in sorted(below.rglob("*.npy"))}
+    files = sorted(path for path in below.rglob("*.npy*") if path.name.endswith((".npy", PACKED)))
+    found = {path.relative_to(below).as_posix().removesuffix(".gz").removesuffix(".npy"): path for path in files}
     if not found:
         return None  # pictures for people
     chosen = match_names(f"{key} maps", list(found), views, where=str(below), whole=False)
@@ -229,9 +245,13 @@ def _archive(path: Path, key: str) -> tuple[list[str], Any]:
 
 def _load(path: Path) -> Any:
     try:
+        if path.name.endswith(PACKED):
+            with gzip.open(path) as stream:
+                values = np.load(stream, allow_pickle=False)
+            return values[..., 0] if values.ndim == 3 and values.shape[-1] == 1 else values
         loaded = np.load(path, allow_pickle=False)
         return loaded if isinstance(loaded, np.ndarray) else {name: loaded[name] for name in loaded.files}
-    except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:
+    except (OSError, EOFError, ValueError, zlib.error, zipfile.BadZipFile) as error:
         raise ValueError(f"{path} is no .npy or .npz of numbers and text ({type(error).__name__})") from None
 
 

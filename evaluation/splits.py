@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from .transforms_file import clean_name, first_twice, read_json
 
 FILE_LISTS = {"train_filenames": "train", "val_filenames": "val", "test_filenames": "test"}
+TRAIN_NAMES, EVAL_NAMES = ("train",), ("eval", "test", "val")  # sweeps that are meant if none is named
 Splits = Mapping[str, Sequence[str]] | str | Path
 
 
@@ -111,3 +112,29 @@ def _train_or_eval(name: str) -> str | None:
 
 def _folder(name: str) -> str | None:
     return posixpath.dirname(name).removeprefix("images/") or None
+
+
+def choose_split(
+    splits: Mapping[str, Any], named: str | None, usual: Sequence[str], option: str, *, whole: bool = False
+) -> str:
+    """The sweep that is meant: the one named, else the first of the usual names that there is.
+
+    Args:
+        splits: of a capture, by name.
+        named: by the user; whether it is there, :meth:`~.captures.Capture.split` says.
+        usual: ``TRAIN_NAMES`` or ``EVAL_NAMES``.
+        option: for the message.
+        whole: a capture without any sweeps means all of it.
+
+    Raises:
+        ValueError: nothing is named, and none of the usual names is there.
+    """
+    if named is not None:
+        return named
+    found = next((name for name in usual if name in splits), None)
+    if found is not None:
+        return found
+    if whole and not splits:
+        return "all"
+    known = ", ".join(splits) or "none: --splits can name them, or --train-split all --every 8"
+    raise ValueError(f"{option} must say which sweep is meant; the capture has {known}")

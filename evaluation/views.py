@@ -37,6 +37,17 @@ def check_depth(caller: str, name: str, values: NDArray[Any] | None) -> None:
         raise ValueError(f"{caller}: {name} must be > 0 (inf for no surface), {bad} values are not ({nan} NaN)")
 
 
+def check_normals(caller: str, name: str, values: NDArray[Any] | None) -> None:
+    """Normals must be unit vectors (to a thousandth), or NaN in all three for none; the others are counted."""
+    if values is None:
+        return
+    none = np.isnan(values).all(axis=-1)
+    length = np.linalg.norm(np.where(none[..., None], 0.0, values), axis=-1)
+    bad = int((~none & ~(np.abs(length - 1.0) <= 1e-3)).sum())
+    if bad:
+        raise ValueError(f"{caller}: {name} must be unit vectors, or NaN for none; {bad} are not")
+
+
 @dataclass(frozen=True, eq=False)
 class Renders:
     """Rendered evaluation views of one method.
@@ -60,6 +71,7 @@ class Renders:
         _map_shape("Renders", "accumulation", self.accumulation, shape)
         _map_shape("Renders", "normals", self.normals, (*shape, 3))
         check_depth("Renders", "depth", self.depth)
+        check_normals("Renders", "normals", self.normals)
 
     def __len__(self) -> int:
         return len(self.colours)
@@ -94,6 +106,7 @@ class Truth:
         if self.visible is not None and self.visible.dtype != np.bool_:
             raise ValueError(f"Truth: visible must be bool, got {self.visible.dtype}")
         check_depth("Truth", "depth", self.depth)
+        check_normals("Truth", "normals", self.normals)
         if self.cameras is not None:
             found = (len(self.cameras), self.cameras.height, self.cameras.width)
             if found != shape:

@@ -8,8 +8,6 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-TRAIN_NAMES, EVAL_NAMES = ("train",), ("eval", "test", "val")  # sweeps that are meant if none is named
-
 
 def capture(
     train: Positional[Annotated[Path, arg(metavar="TRAIN")]],
@@ -94,6 +92,7 @@ def convert(
     """
     from .evaluation.difficulty import every_nth
     from .evaluation.nerfstudio_folder import write_nerfstudio
+    from .evaluation.splits import TRAIN_NAMES, choose_split
 
     if plot is not None:
         _check_plot(plot, "convert")
@@ -104,7 +103,7 @@ def convert(
     if every is None:
         train, evaluation = _sweeps(posed, train_split, eval_split)
     else:
-        whole = posed.split(_chosen(posed, train_split, TRAIN_NAMES, "--train-split"))
+        whole = posed.split(choose_split(posed.splits, train_split, TRAIN_NAMES, "--train-split"))
         taught, held_out = every_nth(len(whole), n=every)
         train, evaluation = whole[taught], whole[held_out]
     both = len({*train.tolist(), *evaluation.tolist()})
@@ -137,21 +136,12 @@ def _read(folder: Path, splits: Path | None, missing: str, photos: Path | None) 
     return posed, [str(each.message) for each in caught]
 
 
-def _chosen(posed: Any, named: str | None, usual: tuple[str, ...], option: str) -> str:
-    """The sweep that is meant."""
-    if named is not None:
-        return named
-    found = next((name for name in usual if name in posed.splits), None)
-    if found is None:
-        known = ", ".join(posed.splits) or "none: --splits can name them, or --train-split all --every 8"
-        raise ValueError(f"{option} must say which sweep is meant; the capture has {known}")
-    return found
-
-
 def _sweeps(posed: Any, train: str | None, evaluation: str | None) -> tuple[Any, Any]:
+    from .evaluation.splits import EVAL_NAMES, TRAIN_NAMES, choose_split
+
     return (
-        posed.split(_chosen(posed, train, TRAIN_NAMES, "--train-split")),
-        posed.split(_chosen(posed, evaluation, EVAL_NAMES, "--eval-split")),
+        posed.split(choose_split(posed.splits, train, TRAIN_NAMES, "--train-split")),
+        posed.split(choose_split(posed.splits, evaluation, EVAL_NAMES, "--eval-split")),
     )
 
 

@@ -11,9 +11,9 @@ KIND = "uncertainty"
 
 
 def doubt(
-    renders: Positional[Path], gt: Path, train_renders: Path, eval_split: str = "eval", train_split: str = "train",
-    downscale: float = 1.0, depth_along: Literal["ray", "axis"] = "ray", normalize: bool = True,
-    tolerance: float = 0.05, replace: bool = False,
+    renders: Positional[Path], gt: Path, train_renders: Path, eval_split: str | None = None,
+    train_split: str | None = None, downscale: float = 1.0, depth_along: Literal["ray", "axis"] = "ray",
+    normalize: bool = True, tolerance: float = 0.05, replace: bool = False,
 ) -> None:  # fmt: skip
     """Say which pixels not to trust, by the photos that were trained on; needs renders with depth, but no field.
 
@@ -24,8 +24,8 @@ def doubt(
         renders: folder of the evaluation views: colour pictures, and depth maps in depth/ or maps.npz.
         gt: a capture (transforms.json): the photos and all cameras.
         train_renders: folder with the depth maps of the training views, rendered by the same field.
-        eval_split: the sweep that was rendered.
-        train_split: the sweep that was trained on.
+        eval_split: the sweep that was rendered; eval, test or val unless given.
+        train_split: the sweep that was trained on; train unless given.
         downscale: photo pixels per pixel of the renders, along each axis.
         depth_along: what the depths are measured along: the pixel's ray, or the camera's optical axis.
         normalize: the depths are in units in which the farthest camera coordinate is 1, not the file's.
@@ -37,10 +37,12 @@ def doubt(
     from .evaluation.captures import load_capture
     from .evaluation.protocol import ray_depth
     from .evaluation.renders_folder import read_map, read_method
+    from .evaluation.splits import EVAL_NAMES, TRAIN_NAMES, choose_split
     from .regularizer.photo_doubt import UNSEEN, photo_doubt
 
     capture = load_capture(gt, downscale=downscale, normalize=normalize)
-    views, taught = capture.split(eval_split), capture.split(train_split)
+    views = capture.split(choose_split(capture.splits, eval_split, EVAL_NAMES, "doubt: --eval-split"))
+    taught = capture.split(choose_split(capture.splits, train_split, TRAIN_NAMES, "doubt: --train-split"))
     names, photo_names = ([capture.names[index] for index in part] for part in (views, taught))
     cameras, photo_cameras = capture.cameras.select(views), capture.cameras.select(taught)
     shape = cameras.height, cameras.width

@@ -27,16 +27,16 @@ def evaluate(
     renders: Positional[tuple[str, ...]], gt: Path, out: Path = Path("out/evaluate"), against: tuple[str, ...] = (),
     masks: Path | None = None, convention: str | None = None, metrics: tuple[str, ...] = (),
     lpips: Literal["none", "alex", "vgg", "squeeze"] = "none", downscale: float = 1.0, eval_split: str | None = None,
-    train_split: str = "train", normalize: bool = True, depth_along: Literal["ray", "axis"] = "ray",
-    occlusion: bool | None = None, min_views: int = 1, sort: str = "psnr", pairs: int = 12, side_by_side: bool = True,
-    resamples: int = 1000, seed: int = 0,
+    train_split: str | None = None, normalize: bool = True, depth_along: Literal["ray", "axis"] = "ray",
+    occlusion: bool | None = None, min_views: int = 1, sort: str | None = None, pairs: int = 12,
+    side_by_side: bool = True, resamples: int = 1000, seed: int = 0,
 ) -> None:  # fmt: skip
     """Score anyone's renders against photos: a page, a results file, a table. No field is needed.
 
     Args:
         renders: folders of colour pictures named as the photos are, DIR or NAME=DIR; depth, accumulation, normals and
             uncertainty maps beside them if there are any (docs/evaluation.md).
-        gt: folder of the photos, or a capture (transforms.json), of which eval-split says which photos.
+        gt: folder of the photos, or a capture (transforms.json or a COLMAP model), of which eval-split says which.
         out: folder for report.html, results.json and images.csv.
         against: renders that the others are compared with, DIR or NAME=DIR; without it, the first of several.
         masks: masks.npz of `unghost masks` (what the training photos saw, depth, cameras), or a folder of
@@ -46,13 +46,14 @@ def evaluate(
         metrics: only these; a metric whose maps are missing is then an error instead of a dash.
         lpips: its backbone; scores of two backbones are different quantities.
         downscale: photo pixels per pixel of the renders, along each axis.
-        eval_split: the sweep of a capture that was rendered; eval unless given, or all if it has no sweeps.
-        train_split: the sweep that was trained on; its cameras set the depth limit where there is no masks.npz.
+        eval_split: the sweep of a capture that was rendered; eval, test or val unless given, all if it has no sweeps.
+        train_split: the sweep that was trained on; its cameras set the depth limit where there is no masks.npz. train,
+            if there is one, unless given.
         normalize: the renders' depth, and masks.npz, are in the capture's normalised units (see unghost masks).
         depth_along: what the renders' depth is measured along: the pixel's ray, or the camera's optical axis.
         occlusion: masks.npz: only what nothing hides from the training cameras; without it, if the file can tell.
         min_views: masks.npz: training views that must see a pixel's point.
-        sort: the worst views by this metric come first.
+        sort: the worst views by this metric come first; psnr unless given, or the first of the metrics.
         pairs: how many views are shown as pictures.
         side_by_side: score under every other convention, too, and tabulate how far they differ; it takes most of the
             time.
@@ -63,9 +64,8 @@ def evaluate(
 
     from .core.results import build_results
     from .evaluation.comparison import choose_convention, compare_methods
-    from .evaluation.page_pictures import worst_first
 
-    worst_first([], sort)  # refused before anything is read
+    key = _sort_key(sort, metrics)  # refused before anything is read
     if not renders:
         raise ValueError("evaluate: no folder of renders is given")
     scene = _scene(gt, masks, downscale, eval_split, train_split, normalize, occlusion, min_views)
@@ -81,7 +81,7 @@ def evaluate(
         network=network, keys=metrics or None, resamples=resamples, side_by_side=side_by_side,
     )  # fmt: skip
     notes = [*scene.notes, *_not_proper(convention, name, methods, scene), *unavailable]
-    details = _details(gt, scene, found["rows"], references, name, sort) | {"notes": notes}
+    details = _details(gt, scene, found["rows"], references, name, key) | {"notes": notes}
     command = shlex.join(["unghost", *sys.argv[1:]])
     results = build_results(found.pop("rows"), command=command, seeds=[seed], evaluation=details, **found)
     _write(out, results, methods, scene, pairs)
@@ -101,6 +101,17 @@ def report(results: Positional[Path], out: Path | None = None) -> None:
     target = results.with_suffix(".html") if out is None else out
     write_page(target, read_results(results))
     print(target)
+
+
+def _sort_key(sort: str | None, metrics: Sequence[str]) -> str:
+    """What the views are sorted by: it must be computed."""
+    from .evaluation.page_pictures import worst_first
+
+    key = sort or ("psnr" if not metrics or "psnr" in metrics else metrics[0])
+    worst_first([], key)
+    if metrics and key not in metrics:
+        raise ValueError(f"evaluate: --sort {key} must be one of --metrics {' '.join(metrics)}")
+    return key
 
 
 def _named(given: Sequence[str]) -> dict[str, Path]:
@@ -148,18 +159,19 @@ def _methods(folders: Mapping[str, Path], scene: _Scene, depth_along: str) -> li
 
 
 def _scene(
-    gt: Path, masks: Path | None, downscale: float, eval_split: str | None, train_split: str, normalize: bool,
-    occlusion: bool | None, min_views: int,
+    gt: Path, masks: Path | None, downscale: float, eval_split: str | None, train_split: str | None,
+    normalize: bool, occlusion: bool | None, min_views: int,
 ) -> _Scene:  # fmt: skip
+    from .evaluation.colmap import find_model
     from .evaluation.conventions import SceneExtent
-    from .evaluation.pseudo import load_pseudo_truth
+    from .evaluation.pseudo import check_cameras, load_pseudo_truth
     from .evaluation.renders_folder import read_masks, read_photos
     from .evaluation.views import Truth
 
     cameras = train_cameras = extent = None
     stored = None if masks is None or masks.is_dir() else load_pseudo_truth(masks)
     views = None if stored is None else stored.names
-    if eval_split is not None or (gt / "transforms.json").is_file():
+    if eval_split is not None or (gt / "transforms.json").is_file() or find_model(gt) is not None:
         names, photos, cameras, train_cameras = _capture(gt, views, downscale, eval_split, train_split, normalize)
     else:
         names, photos = read_photos(gt, views, downscale=downscale)
@@ -171,14 +183,16 @@ def _scene(
                 f"evaluate: the photos are {width} x {height}, {masks} is of {size[0]} x {size[1]}; see --downscale "
                 f"(now {downscale:g})"
             )
-        load_pseudo_truth(masks, eval_cameras=cameras, train_cameras=train_cameras)
+        check_cameras(masks, stored, eval_cameras=cameras, train_cameras=train_cameras)
         aware = stored.seen_open is not None if occlusion is None else occlusion
         truth = stored.truth(photos, occlusion=aware, minimum_views=min_views)
         told = {"masks": masks.name, "occlusion": aware, "min_views": min_views}
         return _Scene(truth, stored.extent, stored.eval_cameras, told)
     visible = None if masks is None else read_masks(masks, names, (height, width))
     notes: tuple[str, ...] = ()
-    if cameras is not None and train_cameras is not None:
+    if cameras is not None and train_cameras is None:
+        notes = ("No depth limit is known: the capture has no sweep called train (see --train-split).",)
+    elif cameras is not None and train_cameras is not None:
         try:
             extent = SceneExtent.of(train_cameras, cameras)
         except ValueError as error:
@@ -188,23 +202,27 @@ def _scene(
 
 
 def _capture(
-    folder: Path, views: Sequence[str] | None, downscale: float, eval_split: str | None, train_split: str,
+    folder: Path, views: Sequence[str] | None, downscale: float, eval_split: str | None, train_split: str | None,
     normalize: bool,
 ) -> tuple[tuple[str, ...], Any, Cameras, Cameras | None]:  # fmt: skip
     import numpy as np
 
     from .evaluation.captures import load_capture
     from .evaluation.renders_folder import match_names
+    from .evaluation.splits import EVAL_NAMES, TRAIN_NAMES, choose_split
 
     capture = load_capture(folder, downscale=downscale, normalize=normalize)
-    split = eval_split or ("eval" if "eval" in capture.splits else "all")
+    split = choose_split(capture.splits, eval_split, EVAL_NAMES, "evaluate: --eval-split", whole=True)
     indices = capture.split(split)
     names = tuple(capture.names[index] for index in indices)
     if views is not None:
         position = {name: index for name, index in zip(names, indices)}
         names = match_names(f"photos of split {split!r}", names, views, where=str(folder), whole=False)
         indices = np.array([position[name] for name in names])
-    taught = capture.cameras.select(capture.split(train_split)) if train_split in capture.splits else None
+    taught = None
+    if train_split is not None or any(name in capture.splits for name in TRAIN_NAMES):
+        named = choose_split(capture.splits, train_split, TRAIN_NAMES, "evaluate: --train-split")
+        taught = capture.cameras.select(capture.split(named))
     return names, capture.images(indices), capture.cameras.select(indices), taught
 
 

@@ -106,6 +106,19 @@ def test_photos_in_two_folders_are_two_sweeps(tmp_path):
     }
 
 
+def test_renders_are_scored_against_a_model_s_photos(tmp_path, capsys):
+    from unghost import cli
+
+    folder = tmp_path / "model"
+    _write(folder, model_of([(f"{sweep}/{name}.png", "PINHOLE") for sweep in ("train", "eval") for name in "ab"]))
+    (tmp_path / "renders").mkdir()
+    for name in "ab":
+        shutil.copy(folder / "images" / "eval" / f"{name}.png", tmp_path / "renders")
+    words = [tmp_path / "renders", "--gt", folder, "--out", tmp_path / "page"]
+    assert cli.main(["evaluate", *map(str, words)]) == 0
+    assert "1 method, 2 views, convention whole_image" in capsys.readouterr().out
+
+
 def test_transforms_json_wins_over_a_model_beside_it(tmp_path):
     folder = _write(tmp_path / "c", model_of(KINDS))
     (folder / "transforms.json").write_text("{}")

@@ -241,7 +241,7 @@ def test_bad_maps_are_refused_when_made():
     spoilt[0, 0, 0] = np.nan
     with pytest.raises(ValueError, match=r"pseudo_depth must be > 0 .* 1 values are not"):
         make_pseudo_truth(EVAL, TRAIN, spoilt)
-    with pytest.raises(ValueError, match="normals must be unit vectors or NaN, 640 are not"):
+    with pytest.raises(ValueError, match="normals must be unit vectors, or NaN for none; 640 are not"):
         make_pseudo_truth(EVAL, TRAIN, depth, normals=np.ones((2, HEIGHT, WIDTH, 3)))
     with pytest.raises(ValueError, match=r"normals must have shape \(2, 16, 20, 3\), got \(2, 16, 20\)"):
         make_pseudo_truth(EVAL, TRAIN, depth, normals=depth)

@@ -1,3 +1,4 @@
+import gzip
 import sys
 
 import numpy as np
@@ -164,6 +165,33 @@ def test_photos_are_shrunk_by_the_mean_of_their_pixels(tmp_path):
     with pytest.raises(ValueError, match=r"downscale must be >= 1, got 0\.5"):
         read_photos(tmp_path, downscale=0.5)
     assert read_photos(tmp_path, ("x/p.jpg",))[1].shape == (1, 4, 6, 3)  # more photos than views
+
+
+def test_what_nerfstudio_renders_is_found(tmp_path):
+    depth = np.random.default_rng(0).uniform(1, 2, (2, *SHAPE, 1)).astype(np.float32)
+    for name, value, each in zip("ab", (51, 102), depth):
+        picture(tmp_path / "rgb" / f"{name}.jpg", (value,) * 3)
+        picture(tmp_path / "gt-rgb" / f"{name}.jpg", (9, 9, 9))
+        (tmp_path / "raw-depth").mkdir(exist_ok=True)
+        with gzip.open(tmp_path / "raw-depth" / f"{name}.npy.gz", "wb") as stream:
+            np.save(stream, each)
+    found = read_method("nerfacto", tmp_path, VIEWS, SHAPE).renders
+    np.testing.assert_array_equal(found.depth, depth[..., 0])
+    assert (found.colours[:, 0, 0, 0] * 255).round().tolist() == pytest.approx([51, 102], abs=1)
+    whole = (tmp_path / "raw-depth" / "a.npy.gz").read_bytes()
+    for broken in (whole[:-30], b"no gzip", whole[:12] + b"x" * 40):
+        (tmp_path / "raw-depth" / "a.npy.gz").write_bytes(broken)
+        with pytest.raises(ValueError, match=r"a\.npy\.gz is no \.npy or \.npz of numbers"):
+            read_method("nerfacto", tmp_path, VIEWS, SHAPE)
+
+
+def test_two_masks_of_one_view_are_refused(tmp_path):
+    for name in ("images_a", "depth_a", "b"):
+        picture(tmp_path / f"{name}.png.mask.png", 255, mode="L")
+    with pytest.raises(ValueError, match=r"two masks of a: depth_a\.png\.mask\.png and images_a"):
+        read_masks(tmp_path, ("a.png", "b.png"), SHAPE)
+    (tmp_path / "depth_a.png.mask.png").unlink()
+    assert read_masks(tmp_path, ("a.png", "b.png"), SHAPE).all()
 
 
 def test_masks_as_the_verb_names_them(tmp_path):

@@ -112,6 +112,30 @@ def test_bad_input_is_one_line_and_leaves_nothing(case, tmp_path, capsys, monkey
     assert sorted(path.name for path in tmp_path.rglob("*")) == before
 
 
+def test_frames_of_a_video_outlive_a_failed_posing(tmp_path, capsys, monkeypatch):
+    av = pytest.importorskip("av")
+    monkeypatch.chdir(tmp_path)
+    with av.open("walk.mp4", "w") as container:
+        stream = container.add_stream("mpeg4", rate=10)
+        stream.width = stream.height = 96
+        for _ in range(4):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.full((96, 96, 3), 90, np.uint8), format="rgb24")))
+        container.mux(stream.encode(None))
+    Path("b").mkdir()
+    for number in range(3):
+        Image.new("RGB", (96, 96), (9, 9, 9)).save(Path("b", f"{number}.png"))
+    Path("out.partial").mkdir()
+    Path("out.partial", "mine").write_text("kept")
+    assert run("capture", "walk.mp4", "b", "--out", "out") == 2
+    error = capsys.readouterr().err.splitlines()[-1]
+    (kept,) = tmp_path.glob("out.train.*")
+    assert "COLMAP posed no photos" in error
+    assert f"the frames are kept, those of walk.mp4 in {kept.name}: a folder can be given in a video's place" in error
+    assert len(list(kept.iterdir())) == 4
+    assert Path("out.partial", "mine").read_text() == "kept"  # somebody else's
+    assert {path.name for path in tmp_path.iterdir()} == {"walk.mp4", "b", "out.partial", kept.name}
+
+
 @pytest.fixture
 def three_sweeps(tmp_path):
     """Nine training photos along x, two scored ones beside them, one of a third sweep."""

@@ -123,6 +123,52 @@ def test_mask_pictures_without_depth_are_the_visible_pixels(renders, capture, ma
     assert row["coverage"] == pytest.approx((0.5 + 0.75 + 0.875) / 3)
 
 
+def test_mask_pictures_belong_to_a_plain_folder_of_photos_too(renders, capture, masks):
+    photos = renders / "photos"
+    photos.mkdir()
+    for name in EVAL:
+        (capture / "images" / f"{name}.png").rename(photos / f"{name}.png")
+    assert {path.name for path in masks.glob("*.png")} == {f"images_{name}.png.mask.png" for name in EVAL}
+    assert run(renders / "a", "--gt", photos, "--masks", masks, "--out", renders / "out") == 0
+    (row,) = results(renders / "out")["rows"]
+    assert row["coverage"] == pytest.approx((0.5 + 0.75 + 0.875) / 3)
+
+
+@pytest.mark.parametrize("name", ["val", "test"])
+def test_without_a_sweep_called_eval_it_is_the_usual_other_name(renders, capture, capsys, name):
+    sweeps = json.loads((capture / "splits.json").read_text())
+    (capture / "splits.json").write_text(json.dumps({"train": sweeps["train"], name: sweeps["eval"]}))
+    assert run(renders / "a", "--gt", capture, "--out", renders / "out") == 0  # else: two views have no render
+    assert results(renders / "out")["evaluation"]["views"] == 3
+    (capture / "splits.json").write_text(json.dumps({"walk": sweeps["train"], "back": sweeps["eval"]}))
+    assert run(renders / "a", "--gt", capture, "--out", renders / "new") == 2
+    assert "--eval-split must say which sweep is meant; the capture has walk, back" in capsys.readouterr().err
+    assert run(renders / "a", "--gt", capture, "--eval-split", "back", "--out", renders / "new") == 0
+    assert "No depth limit is known: the capture has no sweep called train" in capsys.readouterr().out
+    words = ["--eval-split", "back", "--train-split", "run"]
+    assert run(renders / "a", "--gt", capture, *words, "--out", renders / "third") == 2
+    assert "no split 'run'" in capsys.readouterr().err
+
+
+def test_views_are_sorted_by_a_metric_that_is_computed(renders, capture):
+    assert run(renders / "a", "--gt", capture, "--metrics", "ssim", "psnr", "--out", renders / "out") == 0
+    assert results(renders / "out")["evaluation"]["sort"] == "psnr"
+    assert run(renders / "a", "--gt", capture, "--metrics", "ssim", "--out", renders / "one") == 0
+    assert results(renders / "one")["evaluation"]["sort"] == "ssim"
+
+
+def test_a_sort_that_is_not_computed_is_refused_before_a_picture_is_read(renders, capture, capsys):
+    words = [renders / "absent", "--gt", capture, "--metrics", "ssim", "--sort", "flip", "--out", renders / "out"]
+    assert run(*words) == 2
+    assert "--sort flip must be one of --metrics ssim" in capsys.readouterr().err
+
+
+def test_normals_that_are_no_directions_are_refused(renders, capture, capsys):
+    np.savez(renders / "a" / "maps.npz", names=np.array(EVAL), normals=np.ones((3, HEIGHT, WIDTH, 3)))
+    assert run(renders / "a", "--gt", capture, "--out", renders / "out") == 2
+    assert f"normals must be unit vectors, or NaN for none; {3 * HEIGHT * WIDTH} are not" in capsys.readouterr().err
+
+
 def test_a_black_mask_gives_dashes_and_no_nan(renders, capture, capsys):
     for name in EVAL:
         Image.new("L", (WIDTH, HEIGHT)).save(renders / f"{name}.png")
