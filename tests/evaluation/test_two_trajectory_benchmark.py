@@ -194,6 +194,21 @@ def test_the_ablation_and_equal_seconds_run(bench, stage, tmp_path, monkeypatch)
     assert 0.3 < found["seconds"] < 3.0  # the median, and the step that was under way
 
 
+def test_of_factors_that_cost_no_psnr_the_best_disparity_is_taken(bench):
+    sweep = importlib.import_module("trajectory_sweep")
+    rows = [{"table": loss, "method": name, "psnr_at_coverage": psnr, "disparity_mae_at_coverage": disparity}
+            for loss, name, psnr, disparity in (("tv", "a", 20.0, 0.3), ("tv", "b", 19.95, 0.2), ("tv", "c", 19.8, 0.1),
+                                                ("sparsity", "a", 20.0, 0.3), ("sparsity", "b", 19.0, 0.2))]  # fmt: skip
+    assert sweep.chosen_factors(rows) == {"tv": "b", "sparsity": "a"}
+
+
+def test_the_factors_are_those_that_the_sweep_chose(bench):
+    stored = json.loads((BENCHMARKS.parent / "docs" / "results" / "two_trajectory_sweep.json").read_text())
+    chosen = {row["table"]: float(row["method"].split()[1]) for row in stored["rows"] if row.get("chosen")}
+    weights = bench["trajectory_job"].Weights()
+    assert {loss: getattr(weights, loss) for loss in chosen} == chosen
+
+
 def test_scenes_are_named_by_what_they_are(bench):
     with pytest.raises(ValueError, match="scene 1 of seed 2026 is room-1, not objects-1"):
         bench["trajectory_scenes"].synthetic_scene(2026, "objects-1", photos=3, views=2, width=12)
