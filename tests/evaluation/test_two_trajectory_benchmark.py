@@ -196,9 +196,10 @@ def test_the_ablation_and_equal_seconds_run(bench, stage, tmp_path, monkeypatch)
 
 def test_of_factors_that_cost_no_psnr_the_best_disparity_is_taken(bench):
     sweep = importlib.import_module("trajectory_sweep")
+    tried = (("tv", "a", 20.0, 0.3), ("tv", "b", 19.95, 0.2), ("tv", "c", 19.8, 0.1), ("sparsity", "a", 20.0, 0.3),
+             ("sparsity", "b", 19.0, 0.2))  # fmt: skip
     rows = [{"table": loss, "method": name, "psnr_at_coverage": psnr, "disparity_mae_at_coverage": disparity}
-            for loss, name, psnr, disparity in (("tv", "a", 20.0, 0.3), ("tv", "b", 19.95, 0.2), ("tv", "c", 19.8, 0.1),
-                                                ("sparsity", "a", 20.0, 0.3), ("sparsity", "b", 19.0, 0.2))]  # fmt: skip
+            for loss, name, psnr, disparity in tried]  # fmt: skip
     assert sweep.chosen_factors(rows) == {"tv": "b", "sparsity": "a"}
 
 
