@@ -51,7 +51,7 @@ class Outcome:
         knob: where the method's knob stood; None without one.
         uncertainty: ``positions -> (M,)``, the method's own, averaged along rays; None: how far a ray's depth spreads.
         background_uncertainty: of light that gets through.
-        asks_photos: the method's own order of pixels is the mean of the ranks by ``uncertainty`` and by photo doubt.
+        asks_photos: the method's own order of pixels is by the product of ``uncertainty`` and photo doubt.
         note: for the row.
     """
 

@@ -98,7 +98,7 @@ def page(results: dict[str, Any]) -> str:
         "**Equal coverage.** Whoever removes more is scored on easier pixels. So every method is cut to the lowest "
         "coverage among all of them on that scene, giving up first the pixels of which it is least sure: `bayes-rays` "
         "by its own uncertainty; `clean` and `dsds-restoration`, alone or with others, by the prior's doubt and by "
-        "whether the training photos bear out the colour (`photo_doubt`; the mean of both ranks); whoever has no such "
+        "how far the training photos contradict the colour (`photo_doubt`; the product of both); whoever has no such "
         "thing by how far the depth along the ray spreads. All kept pixels of a scene count alike.", "",
         "## In plain words", "", *who_wins(results), "",
         "A verdict is \"within chance\" if the 95 % interval of the difference over the scenes holds 0. Angles of "

@@ -21,7 +21,7 @@ from unghost.evaluation.pseudo import PseudoTruth
 from unghost.evaluation.scoring import SceneScores, score_scene, score_under_all
 from unghost.evaluation.sparsification import sparsify
 from unghost.evaluation.views import Renders, Truth
-from unghost.regularizer.photo_doubt import mean_rank, photo_doubt
+from unghost.regularizer.photo_doubt import photo_doubt
 
 CONVENTION = "proper"
 COVERAGES = (0.02, 0.05, *(round(0.05 * step, 2) for step in range(2, 20)))
@@ -61,7 +61,7 @@ def scored(
     mask = evaluation_masks(get_convention(CONVENTION), renders, stage.truth, extent)
     row = {"convention": CONVENTION, **scores.means(), "psnr_visible": _psnr_visible(renders, stage.truth)}
     row["curves"], row["ause"] = {}, {}
-    for name, doubt in _doubts(stage, outcome, views, renders, mask, headline).items():
+    for name, doubt in _doubts(stage, outcome, views, renders, headline).items():
         row["curves"][name] = _curve(stage, renders, mask, doubt, scores)
         row["ause"][name] = _ause(views["depth"], stage.pseudo.depth, doubt, mask)
     if conventions:
@@ -73,9 +73,7 @@ def scored(
             "knob": outcome.knob, "note": outcome.note}  # fmt: skip
 
 
-def _doubts(
-    stage: Stage, outcome: Outcome, views: Views, renders: Renders, mask: NDArray[np.bool_], headline: bool
-) -> dict[str, NDArray[Any]]:
+def _doubts(stage: Stage, outcome: Outcome, views: Views, renders: Renders, headline: bool) -> dict[str, NDArray[Any]]:
     """Order -> uncertainty of every pixel."""
     found = {"own": views["spread"], "spread": views["spread"]}
     if outcome.uncertainty is not None:
@@ -88,7 +86,7 @@ def _doubts(
             slack=SLACK * outcome.field.field_pitch,
         )  # fmt: skip
     if outcome.asks_photos:
-        found["own"] = mean_rank(found["photos"], found["own"], within=mask)
+        found["own"] = found["photos"] * found["own"]
     return found
 
 

@@ -3,7 +3,7 @@
 A pixel of a new view shows a point. If the point is really there, the photos that see it have the pixel's colour; if
 it is a ghost, they look through it at something else. This needs neither a gradient nor the truth, only renders.
 It says little of depths on a plain wall, where everything has one colour: the prior's doubt
-(:meth:`unghost.regularizer.clean.Judgement.doubt`) does, and :func:`mean_rank` joins the two.
+(:meth:`unghost.regularizer.clean.Judgement.doubt`) does. The product of the two ranks colours and depths.
 """
 
 from __future__ import annotations
@@ -92,40 +92,6 @@ def sample_bilinear(image: NDArray[Any], pixels: NDArray[Any]) -> FloatArray:
     upper = (1 - a) * image[top, left] + a * image[top, right]
     lower = (1 - a) * image[bottom, left] + a * image[bottom, right]
     return np.asarray((1 - b) * upper + b * lower, dtype=np.float64)
-
-
-def mean_rank(*doubts: NDArray[Any], within: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
-    """Several doubts of the same pixels as one, whatever their units: the mean of each pixel's ranks.
-
-    Args:
-        doubts: of one shape; larger is less sure; inf is allowed, NaN is not.
-        within: bool, the same shape: only these pixels are ranked, the others get 1. None: all.
-
-    Returns:
-        float32 in [0, 1] of that shape: 0 the surest pixel under every doubt. Equals share a rank.
-
-    Raises:
-        ValueError: no doubt, two shapes, a NaN.
-    """
-    if not doubts:
-        raise ValueError("mean_rank: doubts must hold at least one array")
-    shape = doubts[0].shape
-    chosen = np.ones(shape, dtype=np.bool_) if within is None else within
-    for number, each in enumerate((*doubts, chosen)):
-        if each.shape != shape:
-            raise ValueError(f"mean_rank: all arrays must have shape {shape}, got {each.shape}")
-        if number < len(doubts) and np.isnan(each[chosen]).any():
-            raise ValueError(f"mean_rank: doubt {number} holds {int(np.isnan(each[chosen]).sum())} NaN")
-    result = np.ones(shape, dtype=np.float32)
-    count = int(chosen.sum())
-    if count:
-        total = np.zeros(count)
-        for each in doubts:
-            _, place, equals = np.unique(each[chosen], return_inverse=True, return_counts=True)
-            before = np.cumsum(equals) - equals
-            total += (before + (equals - 1) / 2)[place.reshape(-1)] / max(count - 1, 1)
-        result[chosen] = total / len(doubts)
-    return result
 
 
 def _check(lens: str, cameras: Cameras, **maps: NDArray[Any]) -> None:

@@ -2,12 +2,9 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from scipy.stats import rankdata
 
 from unghost.core.cameras import Cameras
-from unghost.regularizer.photo_doubt import mean_rank, photo_doubt, sample_bilinear
+from unghost.regularizer.photo_doubt import photo_doubt, sample_bilinear
 
 SIDE = 24
 
@@ -91,21 +88,6 @@ def test_bilinear_samples_agree_with_scipy():
     np.testing.assert_allclose(sample_bilinear(image, pixels), wanted, atol=1e-12)
 
 
-@given(st.lists(st.lists(st.integers(0, 5), min_size=6, max_size=6), min_size=1, max_size=3))
-def test_ranks_agree_with_scipy(rows):
-    doubts = [np.array(row, dtype=np.float64).reshape(2, 3) for row in rows]
-    wanted = np.mean([(rankdata(each) - 1) / 5 for each in doubts], axis=0).reshape(2, 3)
-    np.testing.assert_allclose(mean_rank(*doubts), wanted, atol=1e-6)
-
-
-def test_ranks_within_a_mask():
-    values = np.array([[5.0, np.nan, 1.0, np.inf]])
-    within = np.array([[True, False, True, True]])
-    np.testing.assert_array_equal(mean_rank(values, within=within), [[0.5, 1.0, 0.0, 1.0]])
-    assert (mean_rank(values, within=np.zeros((1, 4), dtype=bool)) == 1.0).all()
-    assert mean_rank(np.array([3.0])) == 0.0
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -124,16 +106,3 @@ def test_errors_name_argument_and_rule(change, message):
              "photo_cameras": camera, **change}  # fmt: skip
     with pytest.raises(ValueError, match=f"photo_doubt: {message}"):
         photo_doubt(**given)
-
-
-@pytest.mark.parametrize(
-    ("doubts", "message"),
-    [
-        ((), "at least one"),
-        ((np.zeros(3), np.zeros(4)), r"shape \(3,\), got \(4,\)"),
-        ((np.zeros(2), np.array([0.0, np.nan])), "doubt 1 holds 1 NaN"),
-    ],
-)
-def test_errors_of_ranks(doubts, message):
-    with pytest.raises(ValueError, match=f"mean_rank: .*{message}"):
-        mean_rank(*doubts)
