@@ -210,6 +210,22 @@ def test_the_factors_are_those_that_the_sweep_chose(bench):
     assert {loss: getattr(weights, loss) for loss in chosen} == chosen
 
 
+def test_every_eighth_photo_is_judged_from_where_it_was_taken(bench, monkeypatch):
+    scenes = bench["trajectory_scenes"]
+    monkeypatch.setattr(scenes, "FEWEST_SEEN", 0.0)
+    scene = scenes.synthetic_scene(2026, "room-1", photos=9, views=2, width=16, resolution=24).every_nth()
+    assert (len(scene.train.photos), len(scene.evaluation.photos)) == (7, 2)
+    told, true = scene.evaluation.cameras, scene.again.true_cameras
+    assert np.abs(told.origins - true.origins).max() > 0  # what it is told is a little off
+    pseudo = scene.pseudo(lambda cameras: np.zeros(0))
+    np.testing.assert_array_equal(pseudo.eval_cameras.camera_to_world, true.camera_to_world)
+    np.testing.assert_array_equal(pseudo.train_cameras.camera_to_world, scene.photographed.true_cameras.camera_to_world)
+    origins, directions = true.rays(1)
+    hit = np.isfinite(pseudo.depth[1])
+    points = (origins + directions * pseudo.depth[1][..., None])[hit]
+    assert np.abs(scene.again.scene.signed_distance(points)).max() < 0.01
+
+
 def test_scenes_are_named_by_what_they_are(bench):
     with pytest.raises(ValueError, match="scene 1 of seed 2026 is room-1, not objects-1"):
         bench["trajectory_scenes"].synthetic_scene(2026, "objects-1", photos=3, views=2, width=12)
