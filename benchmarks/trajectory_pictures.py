@@ -1,27 +1,30 @@
 """What the methods of the two-trajectory benchmark look like: colour over depth, from the sweep that is scored.
 
-    python benchmarks/trajectory_pictures.py --scene room-1
+    python benchmarks/trajectory_pictures.py --scene room-0
 
 Fits and improves the field again (fits come from the benchmark's cache if they are there). Writes
-docs/results/two_trajectory_views.png.
+docs/results/two_trajectory_views.png, and two_trajectory_doubt.png: what the photos and the prior doubt of the field as
+it was fitted, beside what is wrong with it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 import tyro
 from fit_cache import FitCache, say
 from trajectory_job import Job, Views, render
-from trajectory_methods import METHODS
-from trajectory_scores import Stage
+from trajectory_methods import METHODS, cleaned
+from trajectory_scores import SLACK, Stage
 from two_trajectory import Options as Benchmark
 from two_trajectory import fitted, stages
 
 from unghost.evaluation.report import draw_comparison
+from unghost.regularizer.photo_doubt import photo_doubt
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -42,9 +45,9 @@ class Options:
         cache: of the benchmark.
     """
 
-    scene: str = "room-1"
+    scene: str = "room-0"
     capture: Path | None = None
-    methods: tuple[str, ...] = ("field", "visibility", "visibility+distortion", "bayes-rays", "dsds-restoration")
+    methods: tuple[str, ...] = ("fitted", "visibility", "visibility+distortion", "bayes-rays", "dsds-restoration")
     views: int = 4
     seed: int = 0
     fit_steps: int = 450
@@ -66,6 +69,37 @@ def columns(options: Options, stage: Stage, cache: FitCache) -> dict[str, Views]
     return found
 
 
+def draw_doubt(path: Path, stage: Stage, job: Job, views: list[int]) -> None:
+    """A row a view: photo, render, photo doubt, the prior's doubt, what is wrong with the colour."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    scene, (judged,) = stage.scene, cleaned(job, job.base, strengths=(0.0,))
+    seen, told = (render(judged, scene, sweep.cameras) for sweep in (scene.evaluation, scene.train))
+    shown = np.clip(seen["rgb"], 0, 1)
+    doubt = photo_doubt(
+        shown, seen["depth"], scene.evaluation.cameras, photos=scene.train.photos, photo_depth=told["depth"],
+        photo_cameras=scene.train.cameras, slack=SLACK * job.base.field_pitch,
+    )  # fmt: skip
+    wrong = np.abs(shown - scene.evaluation.photos).mean(axis=-1)
+    columns: dict[str, tuple[Any, float | None]] = {
+        "photo": (scene.evaluation.photos, None), "the field as fitted": (shown, None),
+        "the photos' doubt": (doubt, 0.3), "the prior's doubt": (seen["uncertainty"], 1.0),
+        "what is wrong (colour)": (wrong, 0.3),
+    }  # fmt: skip
+    figure = Figure(figsize=(2.6 * len(columns), 2.05 * len(views) + 0.5), facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(len(views), len(columns), squeeze=False)
+    for row, view in zip(grid, views):
+        for axes, (name, (values, top)) in zip(row, columns.items()):
+            axes.imshow(values[view], cmap=None if top is None else "magma", vmin=0, vmax=top or 1)
+            axes.axis("off")
+            if view == views[0]:
+                axes.set_title(name, fontsize=11)
+    figure.suptitle(f"{scene.name}: dark is trusted, bright is doubted (or wrong)", fontsize=12)
+    figure.savefig(path, dpi=100, metadata={"Software": None})
+
+
 def main() -> None:
     options = tyro.cli(Options, description=__doc__)
     torch.set_num_threads(options.threads)
@@ -85,6 +119,9 @@ def main() -> None:
             f"Seed {options.seed}, {stage.steps} steps of each method.",
         )  # fmt: skip
         say(str(path))
+        base, _ = fitted(benchmark, cache, "field", stage.scene, stage.scene.train, options.seed, stage.fit_steps)
+        job = Job(stage.scene, base, options.seed, stage.steps, threads=options.threads)
+        draw_doubt(options.out / "two_trajectory_doubt.png", stage, job, views)
 
 
 if __name__ == "__main__":
