@@ -23,8 +23,11 @@ WATCHED = (*OURS, "bayes-rays", "visibility", "field")
 RESAMPLES = 2000
 PLAIN = {
     "psnr_at_coverage": ("masked PSNR at equal coverage", "dB", 1, 2),
+    "psnr_area": ("masked PSNR, mean over equal coverages", "dB", 1, 2),
     "ssim_at_coverage": ("masked SSIM at equal coverage", "", 1, 3),
+    "ssim_area": ("masked SSIM, mean over equal coverages", "", 1, 3),
     "disparity_mae_at_coverage": ("disparity error at equal coverage", "", -1, 3),
+    "disparity_mae_area": ("disparity error, mean over equal coverages", "", -1, 3),
     "free_space_error": ("opacity left in free space", "", -1, 4),
 }
 OTHER_TABLES = {
@@ -99,21 +102,24 @@ def page(results: dict[str, Any]) -> str:
         "coverage among all of them on that scene, giving up first the pixels of which it is least sure: `bayes-rays` "
         "by its own uncertainty; `clean` and `dsds-restoration`, alone or with others, by the prior's doubt and by "
         "how far the training photos contradict the colour (`photo_doubt`; the product of both); whoever has no such "
-        "thing by how far the depth along the ray spreads. All kept pixels of a scene count alike.", "",
+        "thing by how far the depth along the ray spreads. All kept pixels of a scene count alike. **Mean over equal "
+        "coverages**: the same at every coverage from .1 up to that lowest one (`…_area`), for a viewer who would "
+        "rather see less and trust it.", "",
         "## In plain words", "", *who_wins(results), "",
         "A verdict is \"within chance\" if the 95 % interval of the difference over the scenes holds 0. Angles of "
         "normals get none: between neighbouring pixels of renders this small the depth is noise, as the row of "
         f"`{REFERENCE}` shows.", "", *scene_lines(results), "",
         "## At equal coverage", "",
         format_rows(rows, ("at_coverage", "psnr_at_coverage", "ssim_at_coverage", "disparity_mae_at_coverage",
-                           "normal_mean_deg_at_coverage", "psnr_at_0.3", "psnr_at_0.4", "psnr_at_0.5")), "",
+                           "normal_mean_deg_at_coverage", "psnr_area", "ssim_area", "disparity_mae_area")), "",
         "![score over coverage](two_trajectory.png)", "",
         "## How much of that is the order in which pixels are given up?", "",
         "The same renders, cut in each method's own order, all by the spread of the depth, all by what the photos "
         "say, and with the order and the knob that turn out best for the method on that scene (with an eye on the "
         "truth: nobody can have that).", "",
-        format_rows(rows, tuple(f"{key}_at_coverage{order}" for key in ("psnr", "disparity_mae") for order in ORDERS)),
-        "",
+        format_rows(rows, tuple(f"psnr_at_coverage{order}" for order in ORDERS)
+                    + tuple(f"{key}_area{order}" for key in ("psnr", "disparity_mae")
+                            for order in ("", "_by_spread", "_by_photos"))), "",
         "## As the paper's table has it, each method at its own coverage", "",
         format_rows(rows, ("psnr", "ssim", "flip", "depth_mse", "disparity_mae", "normal_mean_deg", "normal_median_deg",
                            "normal_pct_30", "coverage", "psnr_visible", "seconds", "cpu_seconds")), "",

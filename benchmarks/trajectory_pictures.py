@@ -92,12 +92,14 @@ def draw_doubt(path: Path, stage: Stage, job: Job, views: list[int]) -> None:
     grid = figure.subplots(len(views), len(columns), squeeze=False)
     for row, view in zip(grid, views):
         for axes, (name, (values, top)) in zip(row, columns.items()):
-            axes.imshow(values[view], cmap=None if top is None else "magma", vmin=0, vmax=top or 1)
+            axes.imshow(
+                values[view], cmap=None if top is None else "magma", vmin=0, vmax=top or 1, interpolation="nearest"
+            )
             axes.axis("off")
             if view == views[0]:
                 axes.set_title(name, fontsize=11)
     figure.suptitle(f"{scene.name}: dark is trusted, bright is doubted (or wrong)", fontsize=12)
-    figure.savefig(path, dpi=100, metadata={"Software": None})
+    figure.savefig(path, dpi=80, metadata={"Software": None})
 
 
 def main() -> None:

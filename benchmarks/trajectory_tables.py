@@ -3,7 +3,8 @@
 ``psnr_at_coverage`` and its like compare methods on a scene and seed where every one of them is cut to the lowest
 coverage among them, each at its own setting and in its own order of pixels; ``_by_spread`` and ``_by_photos``: all in
 that order; ``_at_best``: the setting of its knob and the order that are best for it there, which takes an eye on the
-truth. Between two measured coverages a score is interpolated linearly (``evaluation/curves.py``).
+truth. ``psnr_area`` and its like are means over all coverages from .1 up to that bar: one coverage is a moment of the
+race. Between two measured coverages a score is interpolated linearly (``evaluation/curves.py``).
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ KEYS = (
 AT_EQUAL = ("psnr", "ssim", "disparity_mae", "normal_mean_deg")
 LOWER_IS_BETTER = ("disparity_mae", "normal_mean_deg")
 FIXED = (0.3, 0.4, 0.5)
+FROM = 0.1  # coverage at which areas begin
 ORDERS = {"": "own", "_by_spread": "spread", "_by_photos": "photos", "_at_best": None}
 REFERENCE = "pseudo-gt"
 FEWER_SEEDS = (REFERENCE, "dsds-paper")
@@ -59,7 +61,7 @@ def summary_rows(cells: Sequence[Cell]) -> list[dict[str, Any]]:
         intervals = {}
         for key in KEYS:
             row[key], intervals[key] = _mean(mine, [_plain(cell, key) for cell in mine])
-        for key in (f"{key}_at_coverage{order}" for key in AT_EQUAL for order in ORDERS):
+        for key in (f"{key}_{how}{order}" for key in AT_EQUAL for how in ("at_coverage", "area") for order in ORDERS):
             row[key], intervals[key] = _mean(mine, [equal.get((_run(cell), method), {}).get(key) for cell in mine])
         row["at_coverage"], _ = _mean(mine, [equal.get((_run(cell), method), {}).get("coverage") for cell in mine])
         for coverage in FIXED:
@@ -145,6 +147,10 @@ def _at_equal_coverage(cells: Sequence[Cell]) -> dict[tuple[Any, str], dict[str,
                 f"{key}_at_coverage{name}": score_at(mine, cell, key, lowest, order)
                 for key in AT_EQUAL for name, order in ORDERS.items() if order is not None or turned
             }  # fmt: skip
+            for key in AT_EQUAL:
+                for name, order in ORDERS.items():
+                    curve = None if order is None or lowest <= FROM else _curve(cell, order, key)
+                    found[f"{key}_area{name}"] = None if curve is None else curve.area(FROM, lowest)
             result[run, cell["method"]] = {"coverage": lowest, **found}
     return result
 

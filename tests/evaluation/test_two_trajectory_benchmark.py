@@ -57,6 +57,7 @@ def test_scores_at_equal_coverage_by_hand(bench):
     assert rows["bold"]["psnr_at_coverage_by_photos"] == 24.0
     assert (rows["bold"]["ause"], rows["bold"]["ause_by_spread"], rows["bold"]["ause_by_photos"]) == (0.5, 0.25, None)
     assert rows["field"]["at_coverage"] == pytest.approx(0.4)
+    assert rows["field"]["psnr_area"] is None  # no curve goes down to .1
     assert rows["field"]["psnr"] == pytest.approx(14.0)
     assert rows["bold"]["psnr"] == 19.0  # what is undefined is left out, never a NaN
     assert rows["pseudo-gt"]["psnr_at_coverage"] is None
@@ -82,6 +83,17 @@ def test_a_run_with_less_coverage_than_curves_reach_counts_for_nobody(bench):
     ]  # fmt: skip
     rows = {row["method"]: row for row in bench["trajectory_tables"].summary_rows(cells)}
     assert (rows["field"]["psnr_at_coverage"], rows["bold"]["psnr_at_coverage"]) == (20.0, 25.0)  # of b alone
+
+
+def test_area_by_hand(bench):
+    cells = [
+        cell("field", "a", 0.5, [(0.5, 10.0), (0.3, 12.0), (0.1, 20.0)], [(0.5, 10.0), (0.1, 14.0)]),
+        cell("bold", "a", 0.3, [(0.3, 11.0), (0.05, 11.0)]),
+    ]
+    rows = {row["method"]: row for row in bench["trajectory_tables"].summary_rows(cells)}
+    assert rows["field"]["psnr_area"] == pytest.approx(16.0)  # from .1 to .3
+    assert rows["field"]["psnr_area_by_spread"] == pytest.approx((14.0 + 12.0) / 2)
+    assert rows["bold"]["psnr_area"] == pytest.approx(11.0)
 
 
 @pytest.mark.parametrize(
