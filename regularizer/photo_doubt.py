@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ..core.cameras import Cameras
 
 FloatArray = NDArray[np.float64]
+CHUNK = 1 << 14  # points at a time: what fits a processor's cache
 UNSEEN = 1.0  # the doubt of a point that no photo shows: black held against white
 
 
@@ -59,23 +60,32 @@ def photo_doubt(
     for index in range(len(cameras)):
         known = np.isfinite(depth[index])
         origins, directions = cameras.rays(index)
-        points = (origins + directions * np.where(known, depth[index], 1.0)[..., None])[known]
-        shown = colors[index][known].astype(np.float64)
-        total, seen = np.zeros(len(points)), np.zeros(len(points), dtype=np.int64)
-        for other in range(len(photo_cameras)):
-            pixels, _, inside = photo_cameras.project(other, points)
-            chosen = np.flatnonzero(inside)
-            column, row = (np.floor(pixels[chosen, axis]).astype(np.int64) for axis in (0, 1))
-            limit = photo_depth[other][
-                np.minimum(row, photo_cameras.height - 1), np.minimum(column, photo_cameras.width - 1)
-            ]
-            distance = np.linalg.norm(points[chosen] - photo_cameras.origins[other], axis=-1)
-            chosen = chosen[distance <= limit * (1.0 + tolerance) + slack]
-            there = sample_bilinear(photos[other], pixels[chosen])
-            total[chosen] += np.abs(there - shown[chosen]).mean(axis=-1)
-            seen[chosen] += 1
-        result[index][known] = np.where(seen > 0, total / np.maximum(seen, 1), UNSEEN)
+        points = origins[known] + directions[known] * depth[index][known][:, None].astype(np.float64)
+        shown, doubt = colors[index][known].astype(np.float64), np.full(len(points), UNSEEN)
+        for start in range(0, len(points), CHUNK):
+            part = slice(start, start + CHUNK)
+            total, seen = np.zeros(len(points[part])), np.zeros(len(points[part]), dtype=np.int64)
+            for other in range(len(photo_cameras)):
+                chosen, pixels = _seen_by(photo_cameras, other, points[part], photo_depth[other], tolerance, slack)
+                total[chosen] += np.abs(sample_bilinear(photos[other], pixels) - shown[part][chosen]).mean(axis=-1)
+                seen[chosen] += 1
+            doubt[part] = np.where(seen > 0, total / np.maximum(seen, 1), UNSEEN)
+        result[index][known] = doubt
     return result
+
+
+def _seen_by(
+    cameras: Cameras, index: int, points: FloatArray, depth: NDArray[Any], tolerance: float, slack: float
+) -> tuple[NDArray[np.int64], FloatArray]:
+    """Which points a photo sees by the field's depth, and at which of its pixels."""
+    pixels, _, inside = cameras.project(index, points)
+    chosen = np.flatnonzero(inside)
+    pixels = pixels[chosen]
+    column, row = (np.floor(pixels[:, axis]).astype(np.int64) for axis in (0, 1))
+    limit = depth[np.minimum(row, cameras.height - 1), np.minimum(column, cameras.width - 1)]
+    away = points[chosen] - cameras.origins[index]
+    near = np.einsum("ni,ni->n", away, away) <= (limit * (1.0 + tolerance) + slack) ** 2
+    return chosen[near], pixels[near]
 
 
 def sample_bilinear(image: NDArray[Any], pixels: NDArray[Any]) -> FloatArray:
@@ -86,11 +96,12 @@ def sample_bilinear(image: NDArray[Any], pixels: NDArray[Any]) -> FloatArray:
     height, width = image.shape[:2]
     x = np.clip(pixels[:, 0] - 0.5, 0, width - 1)
     y = np.clip(pixels[:, 1] - 0.5, 0, height - 1)
-    left, top = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
-    right, bottom = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
+    left, top = x.astype(np.int64), y.astype(np.int64)
     a, b = (x - left)[:, None], (y - top)[:, None]
-    upper = (1 - a) * image[top, left] + a * image[top, right]
-    lower = (1 - a) * image[bottom, left] + a * image[bottom, right]
+    corner, right, below = top * width + left, left < width - 1, np.where(top < height - 1, width, 0)
+    flat = image.reshape(height * width, -1)
+    upper = (1 - a) * flat.take(corner, axis=0) + a * flat.take(corner + right, axis=0)
+    lower = (1 - a) * flat.take(corner + below, axis=0) + a * flat.take(corner + below + right, axis=0)
     return np.asarray((1 - b) * upper + b * lower, dtype=np.float64)
 
 
