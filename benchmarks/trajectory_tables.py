@@ -24,13 +24,14 @@ KEYS = (
     "coverage", "images_scored", "psnr_visible", "ause", "ause_by_spread", "ause_by_photos", "floater_recall",
     "surface_kept", "holes_filled", "free_space_error", "seconds", "cpu_seconds",
 )  # fmt: skip
+SECONDS = ("seconds", "cpu_seconds")  # of rows with the most threads
 AT_EQUAL = ("psnr", "ssim", "disparity_mae", "normal_mean_deg")
 LOWER_IS_BETTER = ("disparity_mae", "normal_mean_deg")
 FIXED = (0.3, 0.4, 0.5)
 FROM = 0.1  # coverage at which areas begin
 ORDERS = {"": "own", "_by_spread": "spread", "_by_photos": "photos", "_at_best": None}
 REFERENCE = "pseudo-gt"
-FEWER_SEEDS = (REFERENCE, "dsds-paper")
+FEWER_SEEDS = (REFERENCE,)
 COLORS = {
     "pseudo-gt": "#bbbbbb", "fitted": "#888888", "field": "#444444", "visibility": "#1f77b4",
     "visibility+sparsity": "#9ecae1", "visibility+tv": "#17becf", "visibility+regnerf": "#74c476",
@@ -59,8 +60,10 @@ def summary_rows(cells: Sequence[Cell]) -> list[dict[str, Any]]:
             "scenes": sorted({cell["scene"] for cell in mine}), "runs": len(mine), "note": mine[0].get("note", ""),
         }  # fmt: skip
         intervals = {}
+        most = max(cell.get("threads", 0) for cell in mine)
         for key in KEYS:
-            row[key], intervals[key] = _mean(mine, [_plain(cell, key) for cell in mine])
+            counted = [cell for cell in mine if key not in SECONDS or cell.get("threads", 0) == most]
+            row[key], intervals[key] = _mean(counted, [_plain(cell, key) for cell in counted])
         for key in (f"{key}_{how}{order}" for key in AT_EQUAL for how in ("at_coverage", "area") for order in ORDERS):
             row[key], intervals[key] = _mean(mine, [equal.get((_run(cell), method), {}).get(key) for cell in mine])
         row["at_coverage"], _ = _mean(mine, [equal.get((_run(cell), method), {}).get("coverage") for cell in mine])

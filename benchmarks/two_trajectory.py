@@ -8,18 +8,22 @@ A field is fitted to one sweep of photos, every method improves it (``trajectory
 each is scored on another sweep under the convention ``proper``, at its own coverage and cut to others, in several
 orders of pixels (``trajectory_scores.py``). Every finished row is saved at once in
 ``docs/results/two_trajectory.json``; what is there is not done again, so that a run that was broken off goes on with
-the same command. ``--equal-seconds`` trains for as long as ``visibility`` took (the median of the main table),
-``--ablation`` does the paper's ablation, ``--every-eighth`` scores every 8th photo of the first sweep. The page:
-``trajectory_page.py``.
+the same command, and several processes may share the file, each with other scenes or seeds (with ``--threads 1``:
+means of seconds are over rows with the most threads). Knobs and the field of both sweeps are looked at on seed 0
+alone.
+``--equal-seconds`` trains for as long as ``visibility`` took (the median of the main table), ``--ablation`` does the
+paper's ablation, ``--every-eighth`` scores every 8th photo of the first sweep. The page: ``trajectory_page.py``.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import fcntl
 import json
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,7 +38,7 @@ from trajectory_job import Job, Outcome
 from trajectory_methods import METHODS, UNTRAINED
 from trajectory_scenes import LabelledSpace, Sweep, TrajectoryScene, captured_scene, synthetic_scene
 from trajectory_scores import CONVENTION, Stage, scored
-from trajectory_tables import summary_rows, write_figures
+from trajectory_tables import FEWER_SEEDS, REFERENCE, summary_rows, write_figures
 
 from unghost.core.results import build_results, write_results
 from unghost.evaluation.difficulty import difficulty_rows
@@ -78,7 +82,7 @@ class Options:
     train: str = "trajectory_1"
     eval: str = "trajectory_3"
     downscale: float = 8
-    methods: tuple[str, ...] = ("pseudo-gt", *METHODS)
+    methods: tuple[str, ...] = (REFERENCE, *METHODS)
     seeds: tuple[int, ...] = (0, 1, 2)
     fit_steps: int = 450
     steps: int = 150
@@ -97,11 +101,12 @@ class Options:
             return self
         return dataclasses.replace(self, scenes=SHORT_SCENES, seeds=(0,), fit_steps=150, steps=50)
 
-    def names(self) -> tuple[str, ...]:
+    def names(self, seed: int = 0) -> tuple[str, ...]:
         """Methods of the table; those that do not train have nothing to do with equal seconds."""
         if self.ablation:
             return tuple(ABLATION)
-        left_out = (*UNTRAINED, "pseudo-gt") if self.equal_seconds else ()
+        left_out = (*UNTRAINED, REFERENCE) if self.equal_seconds else ()
+        left_out += FEWER_SEEDS if seed > 0 else ()
         return tuple(name for name in self.methods if name not in left_out)
 
     def table(self) -> str:
@@ -124,10 +129,23 @@ class Ledger:
     def __init__(self, options: Options) -> None:
         self.options = options
         self.path = options.out / f"two_trajectory{'_short' if options.short else ''}.json"
+        self.read()
+
+    def read(self) -> None:
+        """What is on disk, other processes' rows, too."""
         stored = json.loads(self.path.read_text(encoding="utf-8")) if self.path.exists() else {}
         self.cells: list[dict[str, Any]] = stored.get("cells", [])
         self.scenes: dict[str, dict[str, Any]] = stored.get("scenes", {})
         self.commands: list[str] = [each for each in stored.get("command", "").split(" ; ") if each]
+
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """One process at a time, with the file as the last one left it."""
+        self.options.cache.mkdir(parents=True, exist_ok=True)
+        with open(self.options.cache / "ledger.lock", "w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            self.read()
+            yield
 
     def key(self, scene: str, seed: int, method: str, steps: int) -> dict[str, Any]:
         """What a row is known by."""
@@ -150,12 +168,20 @@ class Ledger:
         """How hard a scene is, and how much of its evaluation views was seen."""
         hard, *_ = difficulty_rows(stage.scene.train.cameras, stage.scene.evaluation.cameras)
         hard |= {"visible": float(stage.pseudo.visible(occlusion=True).mean()), "depth_limit": stage.scene.extent.limit}
-        self.scenes.setdefault(self.options.table(), {})[stage.scene.name] = hard
-        self.add([])
+        with self.alone():
+            self.scenes.setdefault(self.options.table(), {})[stage.scene.name] = hard
+            self.write()
 
-    def add(self, rows: list[dict[str, Any]]) -> None:
-        """Keep rows, and write the file with all means anew."""
-        self.cells += [json_ready(row) for row in rows]
+    def add(self, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        """Keep rows; as they were written."""
+        ready = [json_ready({**row, "threads": self.options.threads}) for row in rows]
+        with self.alone():
+            self.cells += ready
+            self.write()
+        return ready
+
+    def write(self) -> None:
+        """The file, with all means anew."""
         command = " ".join(["python benchmarks/two_trajectory.py", *map(_without_folders, sys.argv[1:])])
         self.commands = [*(each for each in self.commands if each != command), command]
         seeds = sorted({cell["seed"] for cell in self.cells})
@@ -215,8 +241,8 @@ def run_stage(options: Options, stage: Stage, cache: FitCache, ledger: Ledger, p
     scene = stage.scene
     ledger.describe(stage)
     table: dict[str, Callable[[Job], list[Outcome]]] = ABLATION if options.ablation else METHODS
-    names = options.names()
     for seed in options.seeds:
+        names = options.names(seed)
         keys = {name: ledger.key(scene.name, seed, name, stage.steps) for name in names}
         job: Job | None = None
         space: LabelledSpace | None = None
@@ -229,16 +255,14 @@ def run_stage(options: Options, stage: Stage, cache: FitCache, ledger: Ledger, p
                 budget = ledger.seconds_of(scene.name, "visibility") if options.equal_seconds else None
                 job = Job(scene, base, seed, stage.steps, budget, threads=options.threads)
                 space = LabelledSpace(scene, base, seed) if scene.photographed is not None else None
-            if name == "pseudo-gt":
+            if name == REFERENCE:
                 both = scene.train.joined(scene.evaluation)
                 better, seconds = fitted(options, cache, "pseudo", scene, both, seed, stage.fit_steps)
                 outcomes = [Outcome(better, seconds)]
             else:
                 outcomes = table[name](job)
-            if seed != options.seeds[0]:  # other settings of a knob are looked at once
-                outcomes = outcomes[:1]
-            ledger.add(rows_of(keys[name], stage, outcomes, space))
-            last = ledger.cells[-len(outcomes)]
+            outcomes = outcomes[:1] if seed > 0 else outcomes  # other settings of a knob are looked at once
+            last, *_ = ledger.add(rows_of(keys[name], stage, outcomes, space))
             say("    " + " ".join(f"{key} {last[key]:.3f}" for key in ("psnr", "disparity_mae", "coverage", "seconds")
                                   if last.get(key) is not None))  # fmt: skip
 
@@ -247,9 +271,9 @@ def main() -> None:
     options = tyro.cli(Options, description=__doc__).shortened()
     torch.set_num_threads(options.threads)
     cache, ledger = FitCache(options.cache), Ledger(options)
-    names = options.names()
-    count = (len(options.scenes) + (options.capture is not None)) * len(options.seeds)
-    plan = Plan(list(names) * count, dict.fromkeys(names, 40.0))
+    count = len(options.scenes) + (options.capture is not None)
+    names = [name for seed in options.seeds for name in options.names(seed)]
+    plan = Plan(names * count, dict.fromkeys(names, 40.0))
     begun = time.perf_counter()
     for stage in stages(options, cache):
         run_stage(options, stage, cache, ledger, plan)

@@ -178,6 +178,19 @@ def test_every_method_runs_and_a_run_goes_on_where_it_was_broken_off(bench, stag
     assert len(again.cells) == len(ledger.cells)
 
 
+def test_processes_share_the_file(bench, tmp_path):
+    main = bench["two_trajectory"]
+    two, one = (main.Options(out=tmp_path, cache=tmp_path, threads=threads) for threads in (2, 1))
+    first, second = main.Ledger(two), main.Ledger(one)  # both have read an empty file
+    row = {"table": "main", "scene": "a", "method": "field", "convention": "proper", "coverage": 0.5}
+    first.add([{**row, "seed": 0, "seconds": 3.0, "psnr": 20.0}])
+    second.add([{**row, "seed": 1, "seconds": 9.0, "psnr": 30.0}])
+    stored = json.loads(first.path.read_text())
+    assert [(cell["seed"], cell["threads"]) for cell in stored["cells"]] == [(0, 2), (1, 1)]
+    (mean,) = stored["rows"]
+    assert (mean["runs"], mean["psnr"], mean["seconds"]) == (2, 25.0, 3.0)
+
+
 @pytest.mark.slow
 def test_the_ablation_and_equal_seconds_run(bench, stage, tmp_path, monkeypatch):
     main = bench["two_trajectory"]
@@ -194,12 +207,14 @@ def test_the_ablation_and_equal_seconds_run(bench, stage, tmp_path, monkeypatch)
     seconds = main.Options(seeds=(0,), fit_steps=8, methods=wanted, out=tmp_path, cache=tmp_path / "c", threads=1,
                            equal_seconds=True)  # fmt: skip
     assert seconds.names() == ("field",)
+    assert "pseudo-gt" in options.methods
+    assert "pseudo-gt" not in main.Options().names(seed=1)
     with pytest.raises(ValueError, match="do the main table of room-1 first"):
         main.run_stage(seconds, stage, cache, main.Ledger(seconds), main.Plan(["field"], {"field": 1.0}))
     ledger = main.Ledger(seconds)
     took = [{"table": "main", "scene": "room-1", "seed": seed, "method": "visibility", "convention": "proper",
              "coverage": 0.5, "seconds": each} for seed, each in enumerate((0.2, 0.4, 9.0))]  # fmt: skip
-    ledger.cells += took
+    ledger.add(took)
     main.run_stage(seconds, stage, cache, ledger, main.Plan(["field"], {"field": 1.0}))
     found = ledger.cells[-1]
     assert (found["table"], found["method"]) == ("equal seconds", "field")
