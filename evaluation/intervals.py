@@ -7,9 +7,8 @@ an interval are order statistics, never interpolated.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,10 +60,8 @@ def bootstrap_mean(
     if len(known) < 2:
         return Interval(float(known[0]) if len(known) else None, None, None, level, len(known), undefined)
 
-    def draw() -> float:
-        return float(known[rng.integers(0, len(known), len(known))].mean())
-
-    low, high = _ends(draw, level, resamples)
+    means = known[rng.integers(0, len(known), (resamples, len(known)))].mean(axis=1)
+    low, high = _ends(means, level)
     return Interval(float(known.mean()), low, high, level, len(known), undefined)
 
 
@@ -83,7 +80,7 @@ def bootstrap_scenes(
 
     Args:
         scenes: name -> one value an image.
-        rng: explicit generator.
+        rng: draws the scenes of all resamples, then the images of one scene after the other.
         level: in (0, 1).
         resamples: >= 1.
         mean_over: ``"scenes"`` (mean of the scenes' means) or ``"images"`` (of all images).
@@ -101,11 +98,14 @@ def bootstrap_scenes(
     if count < 2:
         return Interval(mean(known) if count else None, None, None, level, count, undefined)
 
-    def draw() -> float:
-        chosen = [known[index] for index in rng.integers(0, len(known), len(known))]
-        return mean([values[rng.integers(0, len(values), len(values))] for values in chosen])
-
-    low, high = _ends(draw, level, resamples)
+    chosen = rng.integers(0, len(known), (resamples, len(known)))
+    sums, images = np.zeros(chosen.shape), np.zeros(chosen.shape)
+    for index, values in enumerate(known):
+        drawn = chosen == index
+        size = int(drawn.sum()), len(values)
+        sums[drawn], images[drawn] = values[rng.integers(0, len(values), size)].sum(axis=1), len(values)
+    means = (sums / images).mean(axis=1) if mean_over == "scenes" else sums.sum(axis=1) / images.sum(axis=1)
+    low, high = _ends(means, level)
     return Interval(mean(known), low, high, level, count, undefined)
 
 
@@ -138,7 +138,7 @@ def _check(caller: str, level: float, resamples: int) -> None:
         raise ValueError(f"{caller}: resamples must be >= 1, got {resamples}")
 
 
-def _ends(draw: Callable[[], float], level: float, resamples: int) -> tuple[float, float]:
-    means: NDArray[Any] = np.sort([draw() for _ in range(resamples)])
-    outside = int((1 - level) / 2 * resamples + 1e-9)  # that many fall off at either end
-    return float(means[outside]), float(means[resamples - 1 - outside])
+def _ends(means: FloatArray, level: float) -> tuple[float, float]:
+    outside = int((1 - level) / 2 * len(means) + 1e-9)  # that many fall off at either end
+    means = np.sort(means)
+    return float(means[outside]), float(means[len(means) - 1 - outside])

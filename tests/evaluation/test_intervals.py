@@ -74,6 +74,24 @@ def test_two_equal_scenes_resample_to_either():
     assert (one.low, one.mean, one.high) == (1.0, 1.0, 1.0)
 
 
+@pytest.mark.parametrize("mean_over", ["scenes", "images"])
+def test_scenes_equal_a_loop_over_resamples(mean_over):
+    """Other draws, the same distribution: both ends within the noise of 4,000 resamples."""
+    draws = np.random.default_rng(2)
+    scenes = {name: list(draws.normal(mean, 1.0, size)) for name, mean, size in (("a", 0, 5), ("b", 2, 9), ("c", 3, 2))}
+    found = bootstrap_scenes(scenes, np.random.default_rng(0), resamples=4000, level=0.8, mean_over=mean_over)
+    rng, means = np.random.default_rng(1), []
+    for _ in range(4000):
+        parts = []
+        for index in rng.integers(0, 3, 3):
+            values = scenes["abc"[index]]
+            parts.append([values[image] for image in rng.integers(0, len(values), len(values))])
+        flat = [value for part in parts for value in part]
+        means.append(np.mean([np.mean(part) for part in parts] if mean_over == "scenes" else flat))
+    means.sort()
+    assert (found.low, found.high) == pytest.approx((means[400], means[3599]), abs=0.08)
+
+
 def test_an_undefined_scene_takes_no_part():
     found = bootstrap_scenes({"a": [1.0, 3.0], "gone": [None, None]}, np.random.default_rng(0))
     assert (found.mean, found.count, found.undefined) == (2.0, 2, 2)
