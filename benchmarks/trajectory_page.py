@@ -24,6 +24,8 @@ RESAMPLES = 2000
 PLAIN = {
     "psnr_at_coverage": ("masked PSNR at equal coverage", "dB", 1, 2),
     "psnr_area": ("masked PSNR, mean over equal coverages", "dB", 1, 2),
+    "psnr_area_by_spread": ("masked PSNR, that mean, if all are cut by the spread of the depth", "dB", 1, 2),
+    "psnr_area_by_photos": ("masked PSNR, that mean, if all are cut by photo doubt", "dB", 1, 2),
     "ssim_at_coverage": ("masked SSIM at equal coverage", "", 1, 3),
     "ssim_area": ("masked SSIM, mean over equal coverages", "", 1, 3),
     "disparity_mae_at_coverage": ("disparity error at equal coverage", "", -1, 3),
@@ -84,8 +86,20 @@ def difference(cells: list[Row], ours: str, rival: str, key: str, sign: int) -> 
     return bootstrap_difference(*pairs, np.random.default_rng(0), resamples=RESAMPLES)
 
 
-def page(results: dict[str, Any]) -> str:
-    """The whole text."""
+PICTURES = {
+    "two_trajectory_views.png": "What the methods look like from the other sweep",
+    "two_trajectory_doubt.png": "What the photos and the prior doubt of the field as it was fitted, and what is wrong",
+}
+
+
+def picture_lines(folder: Path) -> list[str]:
+    """Those of ``trajectory_pictures.py`` that are there."""
+    there = {name: said for name, said in PICTURES.items() if (folder / name).exists()}
+    return [line for name, said in there.items() for line in (f"{said}:", "", f"![{said.lower()}]({name})", "")]
+
+
+def page(results: dict[str, Any], folder: Path) -> str:
+    """The whole text; ``folder``: where it will stand, beside its pictures."""
     cells, rows = results["cells"], main_rows(results, "main")
     scenes = list(dict.fromkeys(cell["scene"] for cell in cells if cell["table"] == "main"))
     seeds = sorted({cell["seed"] for cell in cells if cell["table"] == "main"})
@@ -108,7 +122,7 @@ def page(results: dict[str, Any]) -> str:
         "## In plain words", "", *who_wins(results), "",
         "A verdict is \"within chance\" if the 95 % interval of the difference over the scenes holds 0. Angles of "
         "normals get none: between neighbouring pixels of renders this small the depth is noise, as the row of "
-        f"`{REFERENCE}` shows.", "", *scene_lines(results), "",
+        f"`{REFERENCE}` shows.", "", *picture_lines(folder), *scene_lines(results), "",
         "## At equal coverage", "",
         format_rows(rows, ("at_coverage", "psnr_at_coverage", "ssim_at_coverage", "disparity_mae_at_coverage",
                            "normal_mean_deg_at_coverage", "psnr_area", "ssim_area", "disparity_mae_area")), "",
@@ -194,7 +208,7 @@ def main() -> None:
     results = json.loads(path.read_text(encoding="utf-8"))
     results["rows"] = summary_rows(results["cells"])
     assert set(KEYS) <= set(results["rows"][0])
-    path.with_name("README.md").write_text(page(results), encoding="utf-8")
+    path.with_name("README.md").write_text(page(results, path.parent), encoding="utf-8")
     write_figures(path)
 
 

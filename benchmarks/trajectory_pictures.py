@@ -47,7 +47,7 @@ class Options:
 
     scene: str = "room-0"
     capture: Path | None = None
-    methods: tuple[str, ...] = ("fitted", "visibility", "visibility+distortion", "bayes-rays", "dsds-restoration")
+    methods: tuple[str, ...] = ("fitted", "visibility+distortion", "bayes-rays", "dsds-restoration+distortion", "clean")
     views: int = 4
     seed: int = 0
     fit_steps: int = 450
