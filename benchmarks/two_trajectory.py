@@ -157,11 +157,13 @@ class Ledger:
         return any(all(cell.get(name) == value for name, value in key.items()) for cell in self.cells)
 
     def seconds_of(self, scene: str, method: str) -> float:
-        """What a method of the main table took there, the median over seeds."""
+        """What a method of the main table took there with as many threads, the median over seeds."""
+        wanted = ("main", scene, method, self.options.threads)
         took = [float(cell["seconds"]) for cell in self.cells
-                if (cell["table"], cell["scene"], cell["method"]) == ("main", scene, method)]  # fmt: skip
+                if (cell["table"], cell["scene"], cell["method"], cell.get("threads")) == wanted]  # fmt: skip
         if not took:
-            raise ValueError(f"two_trajectory: equal seconds are those of {method}: do the main table of {scene} first")
+            raise ValueError(f"two_trajectory: equal seconds are those of {method}, threads {self.options.threads}: "
+                             f"do the main table of {scene} first")  # fmt: skip
         return float(np.median(took))
 
     def describe(self, stage: Stage) -> None:

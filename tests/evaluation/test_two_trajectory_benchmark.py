@@ -215,6 +215,9 @@ def test_the_ablation_and_equal_seconds_run(bench, stage, tmp_path, monkeypatch)
     took = [{"table": "main", "scene": "room-1", "seed": seed, "method": "visibility", "convention": "proper",
              "coverage": 0.5, "seconds": each} for seed, each in enumerate((0.2, 0.4, 9.0))]  # fmt: skip
     ledger.add(took)
+    elsewhere = main.Ledger(main.Options(out=tmp_path, cache=tmp_path / "c", threads=2))
+    elsewhere.add([{**took[0], "seconds": 500.0}])  # on another number of threads: no yardstick
+    ledger.read()
     main.run_stage(seconds, stage, cache, ledger, main.Plan(["field"], {"field": 1.0}))
     found = ledger.cells[-1]
     assert (found["table"], found["method"]) == ("equal seconds", "field")
