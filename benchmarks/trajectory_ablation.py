@@ -18,7 +18,9 @@ from unghost.regularizer.cubes import draw_cubes
 from unghost.regularizer.rivals import Squash, sds_loss, squash_density
 from unghost.regularizer.settings import RegularizerSettings
 
+POINTS_A_CELL = 1
 WEIGHT_RAYS = 1024  # of each training photo, whose weights fill the grid
+GRID_EVERY = 10  # steps after which all of the grid is looked at anew, as DSDS learns of its cubes
 EDGES = {"1-10 %": (0.01, 0.1), "10-20 %": (0.1, 0.2), "1-20 %": (0.01, 0.2)}
 
 
@@ -31,6 +33,8 @@ def through_activation(job: Job, how: Squash) -> list[Outcome]:
 
     def term(field: Any, step: int) -> Tensor:
         rng = np.random.default_rng([job.seed, step, 16])
+        if step % GRID_EVERY == 0:
+            _look(regularizer, field, rng)
         cubes = draw_cubes(regularizer.grid, rng, settings, field_pitch=None, resolution=32, device=torch.device("cpu"))
         signed = squash_density(field.density_fn(cubes.positions)[..., 0], threshold=settings.rule.threshold, how=how)
         t = paper_timestep(step)
@@ -43,6 +47,13 @@ def through_activation(job: Job, how: Squash) -> list[Outcome]:
         return settings.dsds_weight * loss[cubes.inside].sum() / max(int(cubes.inside.sum()), 1)
 
     return [fine_tuned(job, lambda job: regularizer, term)]
+
+
+def _look(regularizer: Any, field: Any, rng: np.random.Generator) -> None:
+    """The densities of every cell into the grid that cubes are drawn by."""
+    positions = torch.from_numpy(regularizer.grid.cell_points(rng, POINTS_A_CELL)).float()
+    with torch.no_grad():
+        regularizer.observe(positions, field.density_fn(positions))
 
 
 def by_weights(job: Job) -> list[Outcome]:

@@ -27,7 +27,7 @@ Term = Callable[[Any, int], Tensor]
 
 @dataclass(frozen=True)
 class Weights:
-    """Factors of the rivals' losses, chosen on development scenes (``trajectory_sweep.py``).
+    """Factors of the rivals' losses and their knobs, chosen on development scenes (``trajectory_sweep.py``).
 
     One rule for all: the smallest disparity error of those whose PSNR at equal coverage is within .1 dB of the best.
     """
@@ -37,6 +37,7 @@ class Weights:
     regnerf: float = 1e-2
     distortion: float = 1e-1
     free_space: float = 1e-4
+    bayes_rays: float = 0.9  # the threshold above which what is uncertain goes
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +52,8 @@ class Outcome:
         knob: where the method's knob stood; None without one.
         uncertainty: ``positions -> (M,)``, the method's own, averaged along rays; None: how far a ray's depth spreads.
         background_uncertainty: of light that gets through.
-        asks_photos: the method's own order of pixels is by the product of ``uncertainty`` and photo doubt.
+        uncertain: the field by whose weights ``uncertainty`` is averaged, if not ``field``.
+        asks_photos: the method's own order of pixels is by photo doubt and how far the depth spreads.
         note: for the row.
     """
 
@@ -62,6 +64,7 @@ class Outcome:
     knob: float | None = None
     uncertainty: Callable[[Tensor], Tensor] | None = None
     background_uncertainty: float = 0.0
+    uncertain: Any = None
     asks_photos: bool = False
     note: str = ""
 
@@ -112,13 +115,18 @@ class Clock:
 
 def render(outcome: Outcome, scene: TrajectoryScene, cameras: Cameras, *, values: bool = True) -> Views:
     """``rgb (n, H, W, 3)``, ``depth``, ``accumulation``, ``spread``; with ``values``, the method's ``uncertainty``."""
+
+    def rendered(field: Any, asked: Any) -> Views:
+        views = [render_view(field, cameras, index, sampling=scene.sampling, values=asked)
+                 for index in range(len(cameras))]  # fmt: skip
+        return {key: np.stack([view[key] for view in views]) for key in views[0]}
+
     asked = outcome.uncertainty if values else None
-    views = [render_view(outcome.field, cameras, index, sampling=scene.sampling, values=asked)
-             for index in range(len(cameras))]  # fmt: skip
-    stacked = {key: np.stack([view[key] for view in views]) for key in views[0]}
+    stacked = rendered(outcome.field, asked if outcome.uncertain is None else None)
     if asked is not None:
-        through = 1.0 - stacked["accumulation"]
-        stacked["uncertainty"] = stacked.pop("values") + through * outcome.background_uncertainty
+        doubted = stacked if outcome.uncertain is None else rendered(outcome.uncertain, asked)
+        through = 1.0 - doubted["accumulation"]
+        stacked["uncertainty"] = doubted.pop("values") + through * outcome.background_uncertainty
     return stacked
 
 

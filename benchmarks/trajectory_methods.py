@@ -26,7 +26,7 @@ from unghost.regularizer.settings import RegularizerSettings
 
 PAPER_PRIOR = Path(__file__).parent / "weights" / "small-epsilon.onnx"
 PAPER_TIMESTEPS = (10, 50)
-UNCERTAINTY_THRESHOLDS = (0.9, 0.5, 0.6, 0.7, 0.8, 1.0)  # the first stands in the tables
+UNCERTAINTY_THRESHOLDS = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # that of the weights stands in the tables
 UNCERTAINTY_RAYS = 1 << 16
 STRENGTHS = (0.5, 0.1, 0.3, 0.7)  # the default first: it stands in the tables
 
@@ -44,30 +44,24 @@ def _distorting(job: Job) -> Any:
 
 
 def _dsds_and_distortion(job: Job) -> list[Outcome]:
-    return _with_doubt(job, fine_tuned(job, make_regularizer, config=_distorting(job)))
+    return [_doubted(fine_tuned(job, make_regularizer, config=_distorting(job)))]
 
 
 def restoration(job: Job, **over: Any) -> list[Outcome]:
-    """Trained with DSDS; what stays is doubted by the prior and by the photos."""
-    return _with_doubt(job, fine_tuned(job, lambda job: make_regularizer(job, **over)))
+    """Trained with DSDS; what stays is doubted by the photos."""
+    return [_doubted(fine_tuned(job, lambda job: make_regularizer(job, **over)))]
 
 
-def _with_doubt(job: Job, tuned: Outcome) -> list[Outcome]:
-    clock = Clock()
-    doubted = _doubted(_judged(job, tuned.field))
-    return [dataclasses.replace(tuned, **_sum(tuned, clock), **doubted)]
-
-
-def _judged(job: Job, base: Any, model: str = "default") -> Judgement:
+def judged(job: Job, base: Any, model: str = "default") -> Judgement:
     denoiser = load_denoiser(model, backend="onnx", threads=job.threads)
     return judge(
         base.density_fn, base.aabb, denoiser=denoiser, cameras=job.scene.train.cameras, field_pitch=base.field_pitch
     )
 
 
-def _doubted(judgement: Judgement) -> dict[str, Any]:
-    """Fields of an outcome: its own order of pixels."""
-    return {"uncertainty": judgement.doubt, "background_uncertainty": 0.5, "asks_photos": True}
+def _doubted(outcome: Outcome) -> Outcome:
+    """With our own order of pixels."""
+    return dataclasses.replace(outcome, asks_photos=True)
 
 
 def _sum(before: Outcome, clock: Clock) -> dict[str, float]:
@@ -87,21 +81,30 @@ def paper(job: Job, **over: Any) -> list[Outcome]:
     return [fine_tuned(job, lambda job: make_regularizer(job, denoiser=denoiser, settings=settings), note=note)]
 
 
-def _bayes_rays(job: Job) -> list[Outcome]:
+def bayes_rays(job: Job, base: Any) -> list[Outcome]:
+    """Of a field at each threshold; pixels are ranked by the uncertainty of what is there before anything goes."""
     clock = Clock()
     told = job.scene.train
     found = deformation_uncertainty(
-        job.base, told.cameras, told.photos, seed=job.seed, sampling=job.scene.sampling, level=7,
+        base, told.cameras, told.photos, seed=job.seed, sampling=job.scene.sampling, level=7,
         rays=min(UNCERTAINTY_RAYS, told.photos[..., 0].size),
     )  # fmt: skip
     took = clock.read()
+    mine = job.weights.bayes_rays
     return [
         Outcome(
-            FilteredField(job.base, found.keep(threshold)), **took, knob=threshold,
+            FilteredField(base, found.keep(threshold)), **took, knob=threshold, uncertain=base,
             uncertainty=found.log_deviation, background_uncertainty=LOWEST,
         )
-        for threshold in UNCERTAINTY_THRESHOLDS
+        for threshold in (mine, *(each for each in UNCERTAINTY_THRESHOLDS if each != mine))
     ]  # fmt: skip
+
+
+def _visibility_and_bayes_rays(job: Job) -> list[Outcome]:
+    tuned = once(job, "visibility")
+    found, *_ = bayes_rays(job, tuned.field)
+    spent = {name: getattr(tuned, name) + getattr(found, name) for name in ("seconds", "cpu_seconds")}
+    return [dataclasses.replace(found, **spent, steps=tuned.steps, knob=None)]
 
 
 def _components(job: Job) -> list[Outcome]:
@@ -123,10 +126,10 @@ def _components(job: Job) -> list[Outcome]:
 def cleaned(job: Job, base: Any, *, strengths: tuple[float, ...] = STRENGTHS) -> list[Outcome]:
     """``clean`` of a field at each strength."""
     clock = Clock()
-    judgement = _judged(job, base)
+    judgement = judged(job, base)
     masks = {strength: judgement.mask(strength) for strength in strengths}
     took = clock.read()
-    return [Outcome(FilteredField(base, mask.keep), **took, knob=strength, **_doubted(judgement))
+    return [_doubted(Outcome(FilteredField(base, mask.keep), **took, knob=strength))
             for strength, mask in masks.items()]  # fmt: skip
 
 
@@ -150,6 +153,7 @@ def _clean_after(name: str) -> Callable[[Job], list[Outcome]]:
 
 METHODS: dict[str, Callable[[Job], list[Outcome]]] = {
     "fitted": lambda job: [Outcome(job.base, 0.0)],
+    "photo-doubt": lambda job: [_doubted(Outcome(job.base, 0.0))],
     "field": lambda job: [fine_tuned(job)],
     "visibility": lambda job: [once(job, "visibility")],
     "visibility+sparsity": _with(sparsity),
@@ -157,7 +161,8 @@ METHODS: dict[str, Callable[[Job], list[Outcome]]] = {
     "visibility+regnerf": _with(regnerf),
     "visibility+distortion": _distortion,
     "free-space": lambda job: [fine_tuned(job, None, free_space(job))],
-    "bayes-rays": _bayes_rays,
+    "bayes-rays": lambda job: bayes_rays(job, job.base),
+    "visibility+bayes-rays": _visibility_and_bayes_rays,
     "components": _components,
     "dsds-paper": paper,
     "dsds-restoration": lambda job: [once(job, "dsds-restoration")],
@@ -166,4 +171,4 @@ METHODS: dict[str, Callable[[Job], list[Outcome]]] = {
     "visibility+clean": _clean_after("visibility"),
     "dsds-restoration+clean": _clean_after("dsds-restoration"),
 }
-UNTRAINED = ("fitted", "bayes-rays", "components", "clean")  # equal seconds say nothing of them
+UNTRAINED = ("fitted", "photo-doubt", "bayes-rays", "components", "clean")  # equal seconds say nothing of them

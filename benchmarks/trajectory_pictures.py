@@ -17,8 +17,8 @@ import numpy as np
 import torch
 import tyro
 from fit_cache import FitCache, say
-from trajectory_job import Job, Views, render
-from trajectory_methods import METHODS, cleaned
+from trajectory_job import Job, Outcome, Views, render
+from trajectory_methods import METHODS, judged
 from trajectory_scores import SLACK, Stage
 from two_trajectory import Options as Benchmark
 from two_trajectory import fitted, stages
@@ -74,8 +74,9 @@ def draw_doubt(path: Path, stage: Stage, job: Job, views: list[int]) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    scene, (judged,) = stage.scene, cleaned(job, job.base, strengths=(0.0,))
-    seen, told = (render(judged, scene, sweep.cameras) for sweep in (scene.evaluation, scene.train))
+    scene, prior = stage.scene, judged(job, job.base)
+    told_by = Outcome(job.base, 0.0, uncertainty=prior.doubt, background_uncertainty=0.5)
+    seen, told = (render(told_by, scene, sweep.cameras) for sweep in (scene.evaluation, scene.train))
     shown = np.clip(seen["rgb"], 0, 1)
     doubt = photo_doubt(
         shown, seen["depth"], scene.evaluation.cameras, photos=scene.train.photos, photo_depth=told["depth"],

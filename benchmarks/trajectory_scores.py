@@ -2,7 +2,8 @@
 
 A method gives up pixels in one of three orders: ``own``, by the method's own uncertainty; ``spread``, by how far the
 depth along the ray spreads, which any field can tell; ``photos``, by :func:`unghost.regularizer.photo_doubt`, which
-any field with the photos it was trained on can tell. A method without an uncertainty of its own has ``spread`` as own.
+any field with the photos it was trained on can tell. A method without an uncertainty of its own has ``spread`` as own;
+ours have photo doubt times the root of the spread per depth.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from trajectory_job import Outcome, Views, render
+from trajectory_job import Clock, Outcome, Views, render
 from trajectory_scenes import LabelledSpace, TrajectoryScene
 
 from unghost.evaluation.conventions import evaluation_masks, get_convention
@@ -26,6 +27,7 @@ from unghost.regularizer.photo_doubt import photo_doubt
 CONVENTION = "proper"
 COVERAGES = (0.02, 0.05, *(round(0.05 * step, 2) for step in range(2, 20)))
 CURVE_KEYS = ("psnr", "ssim", "disparity_mae", "normal_mean_deg")
+LEAST_SPREAD = 1e-3  # of a depth: a ray that is all of one mind is no proof
 SLACK = 2.0  # cells of the field behind its depth that a photo still sees
 DIGITS = 4  # of a curve's numbers
 
@@ -61,16 +63,23 @@ def scored(
     mask = evaluation_masks(get_convention(CONVENTION), renders, stage.truth, extent)
     row = {"convention": CONVENTION, **scores.means(), "psnr_visible": _psnr_visible(renders, stage.truth)}
     row["curves"], row["ause"] = {}, {}
-    for name, doubt in _doubts(stage, outcome, views, renders, headline).items():
+    clock = Clock()
+    doubts = _doubts(stage, outcome, views, renders, headline)
+    took = clock.read() if outcome.asks_photos else dict.fromkeys(clock.read(), 0.0)
+    for name, doubt in doubts.items():
+        if name == "own" and doubt is doubts["spread"]:
+            continue
         row["curves"][name] = _curve(stage, renders, mask, doubt, scores)
         row["ause"][name] = _ause(views["depth"], stage.pseudo.depth, doubt, mask)
+    for each in ("curves", "ause"):
+        row[each].setdefault("own", row[each]["spread"])
     if conventions:
         under = score_under_all(renders, stage.truth, extent)
         row["conventions"] = {name: each.means() for name, each in under.items() if each.images}
     if space is not None:
         row |= space.scores(outcome.field)
-    return {**row, "seconds": outcome.seconds, "cpu_seconds": outcome.cpu_seconds, "trained_steps": outcome.steps,
-            "knob": outcome.knob, "note": outcome.note}  # fmt: skip
+    spent = {name: getattr(outcome, name) + took[name] for name in took}
+    return {**row, **spent, "trained_steps": outcome.steps, "knob": outcome.knob, "note": outcome.note}
 
 
 def _doubts(stage: Stage, outcome: Outcome, views: Views, renders: Renders, headline: bool) -> dict[str, NDArray[Any]]:
@@ -86,7 +95,7 @@ def _doubts(stage: Stage, outcome: Outcome, views: Views, renders: Renders, head
             slack=SLACK * outcome.field.field_pitch,
         )  # fmt: skip
     if outcome.asks_photos:
-        found["own"] = found["photos"] * found["own"]
+        found["own"] = found["photos"] * np.sqrt(views["spread"] / views["depth"] + LEAST_SPREAD)
     return found
 
 

@@ -32,10 +32,10 @@ from unghost.evaluation.protocol import json_ready
 ROOT = Path(__file__).resolve().parents[1]
 FACTORS = {
     "sparsity": (1e-4, 1e-3, 1e-2, 1e-1), "tv": (1e-3, 1e-2, 1e-1, 1.0), "regnerf": (1e-3, 1e-2, 1e-1, 1.0),
-    "distortion": (4e-3, 2e-2, 1e-1, 5e-1), "free_space": (1e-6, 1e-5, 1e-4, 1e-3),
+    "distortion": (4e-3, 2e-2, 1e-1, 5e-1), "free_space": (1e-6, 1e-5, 1e-4, 1e-3), "bayes_rays": (0.6, 0.7, 0.8, 0.9),
 }  # fmt: skip
 WITHIN_DB = 0.1
-ROWS = {"free_space": "free-space"}
+ROWS = {"free_space": "free-space", "bayes_rays": "bayes-rays"}
 
 
 @dataclass(frozen=True)

@@ -31,11 +31,12 @@ FIXED = (0.3, 0.4, 0.5)
 FROM = 0.1  # coverage at which areas begin
 ORDERS = {"": "own", "_by_spread": "spread", "_by_photos": "photos", "_at_best": None}
 REFERENCE = "pseudo-gt"
-FEWER_SEEDS = (REFERENCE,)
+FEWER_SEEDS = (REFERENCE, "dsds-paper")
 COLORS = {
     "pseudo-gt": "#bbbbbb", "fitted": "#888888", "field": "#444444", "visibility": "#1f77b4",
     "visibility+sparsity": "#9ecae1", "visibility+tv": "#17becf", "visibility+regnerf": "#74c476",
-    "visibility+distortion": "#9467bd", "free-space": "#e7ba52",
+    "visibility+distortion": "#9467bd", "free-space": "#e7ba52", "photo-doubt": "#bc80bd",
+    "visibility+bayes-rays": "#98df8a",
     "bayes-rays": "#2ca02c", "components": "#8c564b", "dsds-paper": "#f7b6d2",
     "dsds-restoration": "#d62728", "clean": "#ff7f0e", "visibility+clean": "#ffbb78",
     "dsds-restoration+distortion": "#8b0000", "dsds-restoration+clean": "#ff9896",
@@ -88,14 +89,14 @@ def finished(cells: Sequence[Cell]) -> list[Cell]:
     wanted: dict[str, set[str]] = {}
     found: dict[tuple[Any, ...], set[str]] = {}
     for cell in cells:
-        if cell["method"] not in FEWER_SEEDS:
+        if cell["method"] not in FEWER_SEEDS and "@" not in cell["method"]:
             wanted.setdefault(cell["table"], set()).add(cell["method"])
             found.setdefault(_run(cell), set()).add(cell["method"])
     return [cell for cell in cells if wanted.get(cell["table"], set()) <= found.get(_run(cell), set())]
 
 
 def _run(cell: Cell) -> tuple[Any, ...]:
-    return cell["table"], cell["scene"], cell["seed"], cell.get("steps")
+    return tuple(cell.get(key) for key in ("table", "scene", "seed", "steps", "fit_steps", "scene_seed"))
 
 
 def _mean(cells: Sequence[Cell], values: Sequence[float | None]) -> tuple[float | None, list[float | None]]:

@@ -147,10 +147,10 @@ class Ledger:
             self.read()
             yield
 
-    def key(self, scene: str, seed: int, method: str, steps: int) -> dict[str, Any]:
+    def key(self, stage: Stage, seed: int, method: str) -> dict[str, Any]:
         """What a row is known by."""
-        named = {"table": self.options.table(), "scene": scene, "seed": seed, "method": method, "steps": steps}
-        return {**named, "fit_steps": self.options.fit_steps, "scene_seed": self.options.scene_seed}
+        named = {"table": self.options.table(), "scene": stage.scene.name, "seed": seed, "method": method}
+        return {**named, "steps": stage.steps, "fit_steps": stage.fit_steps, "scene_seed": self.options.scene_seed}
 
     def has(self, key: dict[str, Any]) -> bool:
         """Whether that row is finished."""
@@ -245,7 +245,7 @@ def run_stage(options: Options, stage: Stage, cache: FitCache, ledger: Ledger, p
     table: dict[str, Callable[[Job], list[Outcome]]] = ABLATION if options.ablation else METHODS
     for seed in options.seeds:
         names = options.names(seed)
-        keys = {name: ledger.key(scene.name, seed, name, stage.steps) for name in names}
+        keys = {name: ledger.key(stage, seed, name) for name in names}
         job: Job | None = None
         space: LabelledSpace | None = None
         for name in names:

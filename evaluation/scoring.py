@@ -269,6 +269,8 @@ def _geometry_scores(
             for views, each in ((renders, depth), (truth, surface))
         )
         if first is not None and second is not None:
+            if surface is not None and truth.normals is not None:  # given ones know nothing of a limit
+                second = np.where(np.isfinite(surface)[..., None], second, np.nan)
             result |= metrics.normal_errors(first, second, mask)
     return {key: value for key, value in result.items() if key in wanted}
 

@@ -1,9 +1,9 @@
 """Which rendered pixels not to trust, by the photos that a field was trained on. numpy only, no gradient.
 
-A pixel of a new view shows a point. If the point is really there, the photos that see it have the pixel's colour; if
-it is a ghost, they look through it at something else. This needs neither a gradient nor the truth, only renders.
-It says little of depths on a plain wall, where everything has one colour: the prior's doubt
-(:meth:`unghost.regularizer.clean.Judgement.doubt`) does. The product of the two ranks colours and depths.
+A pixel of a new view shows a point. If the point is really there, the photos that see it have the pixel's colour, and
+the field, looked at from where they were taken, has a surface there. If it is a ghost, they look through it at
+something else. The mean over many photos can be trusted more than that over few, like any mean. This needs neither a
+gradient nor the truth, only renders.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def photo_doubt(
     tolerance: float = 0.05,
     slack: float = 0.0,
 ) -> NDArray[np.float32]:
-    """How far the colour of each rendered pixel is from the colour that the training photos have there.
+    """How far each rendered pixel is from what the training photos have there, and how many photos say so.
 
     Args:
         colors: ``(n, H, W, 3)`` rendered views in [0, 1].
@@ -41,12 +41,14 @@ def photo_doubt(
         photo_depth: ``(m, h, w)`` as the *field* renders it from the photos' cameras, like ``depth``: what lies behind
             it is not seen by that photo.
         photo_cameras: of the photos.
-        tolerance: how far behind that depth a point may lie and still be seen, as a share of it; >= 0.
+        tolerance: how far behind that depth a point may lie and still be seen, and how far from it on either side
+            and still be the same surface, as a share of it; >= 0.
         slack: the same in scene units, on top; two cells of a grid, say.
 
     Returns:
-        ``(n, H, W)`` float32 in [0, 1]: mean absolute difference over the channels and over the photos that see the
-        point; 1 where none does.
+        ``(n, H, W)`` float32 in [0, 1]: the mean absolute difference of colours over the channels and over the photos
+        that see the point, divided by the root of one more than the photos in which the point lies on the surface; 1
+        where no photo sees it.
 
     Raises:
         ValueError: shapes, colours outside [0, 1], depth that is not > 0, a negative tolerance or slack.
@@ -64,28 +66,32 @@ def photo_doubt(
         shown, doubt = colors[index][known].astype(np.float64), np.full(len(points), UNSEEN)
         for start in range(0, len(points), CHUNK):
             part = slice(start, start + CHUNK)
-            total, seen = np.zeros(len(points[part])), np.zeros(len(points[part]), dtype=np.int64)
+            total, seen, same = (np.zeros(len(points[part])) for _ in range(3))
             for other in range(len(photo_cameras)):
-                chosen, pixels = _seen_by(photo_cameras, other, points[part], photo_depth[other], tolerance, slack)
+                chosen, pixels, on = _seen_by(photo_cameras, other, points[part], photo_depth[other], tolerance, slack)
                 total[chosen] += np.abs(sample_bilinear(photos[other], pixels) - shown[part][chosen]).mean(axis=-1)
                 seen[chosen] += 1
-            doubt[part] = np.where(seen > 0, total / np.maximum(seen, 1), UNSEEN)
+                same[chosen] += on
+            doubt[part] = np.where(seen > 0, total / np.maximum(seen, 1) / np.sqrt(1 + same), UNSEEN)
         result[index][known] = doubt
     return result
 
 
 def _seen_by(
     cameras: Cameras, index: int, points: FloatArray, depth: NDArray[Any], tolerance: float, slack: float
-) -> tuple[NDArray[np.int64], FloatArray]:
-    """Which points a photo sees by the field's depth, and at which of its pixels."""
+) -> tuple[NDArray[np.int64], FloatArray, NDArray[np.bool_]]:
+    """Which points a photo sees by the field's depth, at which of its pixels, and whether on the surface there."""
     pixels, _, inside = cameras.project(index, points)
     chosen = np.flatnonzero(inside)
     pixels = pixels[chosen]
     column, row = (np.floor(pixels[:, axis]).astype(np.int64) for axis in (0, 1))
     limit = depth[np.minimum(row, cameras.height - 1), np.minimum(column, cameras.width - 1)]
     away = points[chosen] - cameras.origins[index]
-    near = np.einsum("ni,ni->n", away, away) <= (limit * (1.0 + tolerance) + slack) ** 2
-    return chosen[near], pixels[near]
+    squared = np.einsum("ni,ni->n", away, away)
+    near = squared <= (limit * (1.0 + tolerance) + slack) ** 2
+    limit = np.where(np.isfinite(limit), limit, 0.0)[near]  # else nothing is there to lie on
+    on = (limit > 0) & (squared[near] >= np.maximum(limit * (1.0 - tolerance) - slack, 0.0) ** 2)
+    return chosen[near], pixels[near], on
 
 
 def sample_bilinear(image: NDArray[Any], pixels: NDArray[Any]) -> FloatArray:

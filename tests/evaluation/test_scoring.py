@@ -99,6 +99,19 @@ def test_geometry_is_clipped_properly_and_not_in_the_code():
     assert proper["normal_pct_30"] is not None
 
 
+def test_stored_normals_beyond_the_limit_do_not_count():
+    renders, truth = _scene()
+    given = np.broadcast_to([0.0, 0.0, 1.0], (*truth.depth.shape, 3)).copy()
+    given[:, :4] = (0.0, 1.0, 0.0)
+    pseudo = truth.depth.copy()
+    pseudo[:, :4] = 100.0
+    told = dataclasses.replace(renders, normals=np.broadcast_to([0.0, 0.0, 1.0], given.shape))
+    truth = dataclasses.replace(truth, depth=pseudo, normals=given)
+    assert scoring.score_scene(told, truth, EXTENT, convention="proper").means()["normal_mean_deg"] == 0.0
+    uncut = scoring.score_scene(told, truth, EXTENT, convention="paper_code").means()["normal_mean_deg"]
+    assert uncut == pytest.approx(45.0)
+
+
 def test_given_normals_are_used_and_need_no_cameras():
     renders, truth = _scene()
     tilt = np.radians(40)

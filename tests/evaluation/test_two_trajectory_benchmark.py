@@ -1,5 +1,6 @@
 """Parts of benchmarks/two_trajectory.py: what its tables say, and each method on a scene of a few pixels."""
 
+import functools
 import importlib
 import json
 from pathlib import Path
@@ -75,6 +76,18 @@ def test_scores_at_equal_coverage_by_hand(bench):
     assert apart == {"bold": {"a": 19.0, "b": 13.0}, "field": {"a": 20.5, "b": 14.0}}
 
 
+def test_seeds_on_which_no_knob_was_turned_count(bench):
+    knob = cell("bold @ 0.9", "a", 0.2, [(0.2, 30.0)], psnr=30.0)
+    both = [cell(method, "a", 0.5, [(0.5, 20.0)], psnr=20.0) for method in ("bold", "field")]
+    other = [{**each, "seed": 1, "psnr": 30.0} for each in both]
+    rows = {row["method"]: row for row in bench["trajectory_tables"].summary_rows([*both, knob, *other])}
+    assert (rows["bold"]["runs"], rows["bold"]["psnr"], rows["bold @ 0.9"]["runs"]) == (2, 25.0, 1)
+    assert len(bench["trajectory_tables"].finished([*both, knob, *other[:1]])) == 3  # field is missing on seed 1
+    elsewhere = [{**each, "scene_seed": 555, "coverage": 0.1} for each in both]
+    rows = {row["method"]: row for row in bench["trajectory_tables"].summary_rows([*both, *elsewhere])}
+    assert rows["bold"]["at_coverage"] == pytest.approx(0.5)  # no bar is shared with another scene of that name
+
+
 def test_a_run_with_less_coverage_than_curves_reach_counts_for_nobody(bench):
     cells = [
         cell("field", "a", 0.8, [(0.8, 18.0), (0.1, 21.0)]), cell("bold", "a", 0.05, [(0.05, 30.0)]),
@@ -135,6 +148,8 @@ def test_every_method_runs_and_a_run_goes_on_where_it_was_broken_off(bench, stag
     monkeypatch.setattr(rivals, "SPARSITY_POINTS", 500)
     monkeypatch.setattr(methods, "UNCERTAINTY_THRESHOLDS", (1.0, 0.9))
     monkeypatch.setattr(methods, "STRENGTHS", (0.5, 0.1))
+    careful = bench["trajectory_job"].Weights(bayes_rays=1.0)  # of so poor a field all is uncertain
+    monkeypatch.setattr(main, "Job", functools.partial(main.Job, weights=careful))
     options = main.Options(seeds=(0,), fit_steps=8, steps=2, out=tmp_path, cache=tmp_path / "cache", threads=1)
     cache, ledger = main.FitCache(options.cache), main.Ledger(options)
 
@@ -150,12 +165,14 @@ def test_every_method_runs_and_a_run_goes_on_where_it_was_broken_off(bench, stag
     assert done["visibility"]["trained_steps"] == 2
     assert done["dsds-restoration"]["seconds"] > 0 < done["dsds-restoration"]["cpu_seconds"]
     assert done["fitted"]["coverage"] == done["bayes-rays"]["coverage"]
+    assert done["photo-doubt"]["psnr"] == done["fitted"]["psnr"]
+    assert done["photo-doubt"]["seconds"] > 0 == done["fitted"]["seconds"]
     for method in options.methods:
         curves = done[method]["curves"]
         assert {"own", "spread", "photos"} == set(curves)
         assert len({tuple(each["coverage"]) for each in curves.values()}) == 1
         assert (curves["own"] != curves["spread"]) == (
-            method == "bayes-rays" or "clean" in method or "restor" in method
+            method == "photo-doubt" or "bayes" in method or "clean" in method or "restor" in method
         )
     assert {"own", "spread"} == set(done["bayes-rays @ 0.9"]["curves"])
     assert done["clean"]["trained_steps"] == 0

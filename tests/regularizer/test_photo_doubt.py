@@ -59,10 +59,30 @@ def test_by_hand_for_one_pixel_and_one_that_nobody_sees():
     found = photo_doubt(grey, depth, camera, photos=photos, photo_depth=depth, photo_cameras=camera)
     assert found.dtype == np.float32
     assert found[0, 0, 0] == 1.0
-    np.testing.assert_allclose(found[0, 5:-5, 5:-5], (0.0 + 0.25 + 0.75) / 3, rtol=1e-6)
+    np.testing.assert_allclose(found[0, 5:-5, 5:-5], (0.0 + 0.25 + 0.75) / 3 / 2**0.5, rtol=1e-6)
 
 
-def test_the_mean_over_photos_does_not_depend_on_their_order():
+@pytest.mark.parametrize("nearer", [1.0, 0.97, 0.9])
+def test_photos_in_which_the_point_is_on_the_surface_make_it_surer(nearer):
+    camera, many = looking_down([(0.0, 0.0)]), looking_down([(0.0, 0.0)] * 8)
+    grey, photos = np.full((1, SIDE, SIDE, 3), 0.5), np.full((8, SIDE, SIDE, 3), 0.25)
+    depth = np.full((1, SIDE, SIDE), 2.0)
+    found = photo_doubt(grey, depth * nearer, camera, photos=photos, photo_depth=np.repeat(depth, 8, axis=0),
+                        photo_cameras=many)  # fmt: skip
+    np.testing.assert_allclose(found[0, 5:-5, 5:-5], 0.25 / (3.0 if nearer > 0.95 else 1.0), rtol=1e-6)
+
+
+@pytest.mark.parametrize("tolerance", [0.05, 1.0, 3.0])
+def test_a_photo_that_looks_into_nothing_sees_but_has_no_surface(tolerance):
+    camera = looking_down([(0.0, 0.0)])
+    grey, photos = np.full((1, SIDE, SIDE, 3), 0.5), np.full((1, SIDE, SIDE, 3), 0.25)
+    depth = np.full((1, SIDE, SIDE), 2.0)
+    found = photo_doubt(grey, depth, camera, photos=photos, photo_depth=depth * np.inf, photo_cameras=camera,
+                        tolerance=tolerance)  # fmt: skip
+    np.testing.assert_allclose(found[0, 5:-5, 5:-5], 0.25, rtol=1e-6)
+
+
+def test_the_mean_over_photos_that_have_no_surface_there_does_not_depend_on_their_order():
     seen, taught = looking_down([(0.0, 0.0)]), looking_down([(-0.4, 0.0), (0.5, 0.2), (0.0, -0.3)])
     colors, depth = wall(seen, 0.3)
     photos, photo_depth = wall(taught)
