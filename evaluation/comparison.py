@@ -104,7 +104,8 @@ def compare_methods(
     Returns:
         ``rows``: a method each: :func:`unghost.evaluation.scoring.summarize`, and ``per_image``, ``notes``,
         ``infinite`` (metrics whose mean is infinite, stored as null: a render equals its photo), ``psnr_common`` and
-        ``coverage_common`` (on the pixels that count for *every* method), ``curve`` (of a method with a knob),
+        ``coverage_common`` (on the pixels that count for *every* method), ``curve`` (of a method with a knob) and
+        ``point`` (of any), in whose PSNR every pixel counts alike, whichever view it is in,
         ``at_coverage``, ``psnr_at_coverage`` and ``psnr_area`` of :func:`unghost.evaluation.curves.compare`.
         ``differences``: method less reference over the same images, with intervals. ``against_points``: curves
         against points at the points' own coverages. ``conventions``: method -> rows of
@@ -133,6 +134,11 @@ def compare_methods(
         row |= {key: shared[each.name].means().get(stored) for key, stored in _COMMON.items()} if shared else {}
         if each.confidence is not None:
             row["curve"] = _knob(each, truth, extent, convention, masks[each.name])
+        row["point"] = {
+            "coverage": row.get("coverage"),
+            **scores[each.name].pooled(("psnr",)),
+            "convention": convention,
+        }
         rows.append(row)
     ahead = _equal_coverage(rows)
     result: dict[str, Any] = {"rows": rows, "against_points": ahead}
@@ -180,7 +186,7 @@ def _curve_keys(convention: str) -> tuple[str, ...]:
 def _knob(
     method: Method, truth: Truth, extent: SceneExtent | None, convention: str, mask: Mask
 ) -> list[dict[str, Any]]:
-    """Scores of the surest pixels, from all that count down to a tenth of them."""
+    """Scores of the surest pixels, from all that count down to a tenth of them; every pixel counts alike."""
     confidence: NDArray[Any] | None = method.confidence
     if confidence is None or "coverage" not in get_convention(convention).keys:
         return []
@@ -189,8 +195,9 @@ def _knob(
         kept = cut_to_coverage(mask, confidence, coverage=float(share * mask.mean()))
         found = score_scene(
             method.renders, truth, extent, convention=convention, within=kept, keys=_curve_keys(convention)
-        ).means()
-        rows.append({"share_kept": float(share), **{key: found[key] for key in
+        )
+        means = found.means() | found.pooled(("psnr",))
+        rows.append({"share_kept": float(share), **{key: means[key] for key in
                      ("coverage", "psnr", "convention", "images_scored")}})  # fmt: skip
     return rows
 
@@ -199,7 +206,7 @@ def _equal_coverage(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Add the columns of :func:`compare` to the rows; give curves against points."""
     curves = []
     for row in rows:
-        points = row.get("curve") or [row]
+        points = row.get("curve") or [row["point"]]
         known = [each for each in points if None not in (each.get("psnr"), each.get("coverage"))]
         if any(np.isfinite(each["psnr"]) for each in known):
             knob = "share_kept" if row.get("curve") else None

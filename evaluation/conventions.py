@@ -23,6 +23,7 @@ IMAGE_KEYS = ("psnr", "ssim", "lpips")
 DEPTH_KEYS = ("depth_mse", "disparity_mae")
 NORMAL_KEYS = ("normal_mean_deg", "normal_median_deg", "normal_pct_30")
 GEOMETRY_KEYS = (*DEPTH_KEYS, *NORMAL_KEYS)
+AGREEMENT_KEYS = ("dice", "iou", "mask_precision", "mask_recall")
 
 
 @dataclass(frozen=True)
@@ -38,10 +39,11 @@ class Convention:
             distance), ``"unit"`` (two of nerfstudio's units), or None: no such rule.
         accumulation: and only pixels whose predicted accumulation is at least this; None: no such rule.
         psnr, ssim, lpips: the metrics' own conventions.
-        bits: ``"round"`` or ``"truncate"`` if colours (and normals) pass through 8 bits first; None: they do not.
+        bits: ``"round"`` or ``"truncate"`` if colours pass through 8 bits first; None: they do not.
         clipped_depth: pseudo-ground-truth depth is cut at the scene's limit, and has no normal beyond.
         coverage_of: ``"all"`` pixels, or those ``"visible"``.
-        dice: which of the mask's scores is tabulated as Dice: ``"dice"`` or ``"pixel_accuracy"``.
+        dice: which score of the mask of what is claimed (see :func:`claimed_masks`) against what was seen is
+            tabulated as Dice: ``"dice"`` or ``"pixel_accuracy"``.
         mean_over: ``"scenes"``: mean of the scenes' means; ``"images"``: of all images of all scenes.
     """
 
@@ -68,7 +70,7 @@ _ALL = (
     Convention(
         "proper",
         "this project: nothing that is masked out is looked at, and no score improves by removing things",
-        (*IMAGE_KEYS, "flip", *GEOMETRY_KEYS, "coverage", "dice"),
+        (*IMAGE_KEYS, "flip", *GEOMETRY_KEYS, "coverage", *AGREEMENT_KEYS),
         visible=True, depth_limit="scene", ssim="inside_mask", clipped_depth=True,
     ),
     Convention(
@@ -192,9 +194,15 @@ def evaluation_masks(convention: Convention, renders: Renders, truth: Truth, ext
     lacking = missing_maps(convention, renders, truth, extent_known=extent is not None)
     if lacking:
         raise ValueError(f"evaluation_masks: convention {convention.name!r} needs {', '.join(lacking)}")
-    masks = np.ones(truth.photos.shape[:3], dtype=np.bool_)
+    masks = claimed_masks(convention, renders, truth, extent)
     if convention.visible and truth.visible is not None:
         masks &= truth.visible
+    return masks
+
+
+def claimed_masks(convention: Convention, renders: Renders, truth: Truth, extent: SceneExtent | None) -> Mask:
+    """``(n, H, W)`` bool: where the renders claim a surface, by the convention's rules, whether or not it was seen."""
+    masks = np.ones(truth.photos.shape[:3], dtype=np.bool_)
     limit = None if extent is None else extent.depth_limit(convention)
     if limit is not None and renders.depth is not None:
         masks &= renders.depth < limit

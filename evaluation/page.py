@@ -174,7 +174,7 @@ def _coverage_charts(rows: Sequence[Mapping[str, Any]], colours: Mapping[str, in
     for scene in dict.fromkeys(row.get("scene") for row in rows):
         series = []
         for row in (each for each in rows if each.get("scene") == scene):
-            points = sorted((point["coverage"], point["psnr"]) for point in row.get("curve") or [row]
+            points = sorted((point["coverage"], point["psnr"]) for point in row.get("curve") or [row.get("point", row)]
                             if _finite(point.get("coverage")) and _finite(point.get("psnr")))  # fmt: skip
             seed = f", seed {row['seed']}" if row.get("seed") is not None else ""
             notes = tuple(f"{y:.2f} dB at coverage {x:.3f}{seed}" for x, y in points)

@@ -38,6 +38,8 @@ METRICS: Mapping[str, Metric] = {
     "normal_pct_30": Metric("normals within 30°", 1, 3),
     "coverage": Metric("coverage", 0, 3),
     "dice": Metric("Dice", 1, 3),
+    "mask_precision": Metric("of what is claimed, seen", 1, 3),
+    "mask_recall": Metric("of what was seen, claimed", 1, 3),
     "psnr_common": Metric("PSNR on common pixels", 1, 2),
     "coverage_common": Metric("coverage of those", 0, 3),
     "psnr_visible": Metric("PSNR on visible pixels", 1, 2),
@@ -75,10 +77,10 @@ def number(value: Any, digits: int, *, infinite: bool = False) -> str:
     return (shown if float(shown) else shown.removeprefix("-")).replace("-", "−")
 
 
-def heading(key: str) -> str:
-    """A metric's label with an arrow towards better."""
+def heading(key: str, more: str = "") -> str:
+    """A metric's label, what is to be said of it, and an arrow towards better."""
     known = METRICS.get(key)
-    return text(key) if known is None else text(known.label + ARROWS[known.better])
+    return text(key + more) if known is None else text(known.label + more + ARROWS[known.better])
 
 
 def table(heads: Sequence[str], rows: Sequence[Sequence[str]], *, kind: str = "") -> str:
@@ -109,7 +111,8 @@ def present(rows: Sequence[Mapping[str, Any]], keys: Sequence[str], *, at_least:
 def score_table(
     rows: Sequence[Mapping[str, Any]], keys: Sequence[str], swatch: Callable[[str], str] | None = None
 ) -> str:
-    """Methods by metrics, the interval below its mean; rows of two conventions are refused.
+    """Methods by metrics, the interval below its mean; rows of two conventions are refused, LPIPS on two backbones
+    stands in two columns.
 
     Args:
         rows: of one convention.
@@ -117,7 +120,10 @@ def score_table(
         swatch: HTML before a method's name, as the charts colour it.
     """
     one_convention("score_table", rows)
-    columns, labels = present(rows, keys), [key for key in LABEL_KEYS if any(key in row for row in rows)]
+    columns, labels = (
+        _columns(rows, present(rows, keys)),
+        [key for key in LABEL_KEYS if any(key in row for row in rows)],
+    )
     if not columns:
         return ""
     cells = []
@@ -126,9 +132,23 @@ def score_table(
         cells.append([
             name if swatch is None else swatch(str(row["method"])) + name,
             *(text("–" if row.get(key) is None else row[key]) for key in labels),
-            *(_score(row, key) for key in columns),
+            *(_score(row, key) if _same_backbone(row, key, backbone) else "–" for key, backbone in columns),
         ])  # fmt: skip
-    return table(["method", *labels, *map(heading, columns)], cells)
+    heads = [heading(key, "" if backbone is None else f" ({backbone})") for key, backbone in columns]
+    return table(["method", *labels, *heads], cells)
+
+
+def _columns(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> list[tuple[str, str | None]]:
+    """Metric and, of LPIPS, backbone."""
+    found: list[tuple[str, str | None]] = []
+    for key in keys:
+        known = dict.fromkeys(row.get("lpips_backbone") for row in rows if _has(row, key)) if key == "lpips" else [None]
+        found += [(key, backbone) for backbone in known]
+    return found
+
+
+def _same_backbone(row: Mapping[str, Any], key: str, backbone: str | None) -> bool:
+    return key != "lpips" or row.get("lpips_backbone") == backbone
 
 
 def difference_table(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 from . import metrics
 from .checks import Mask
 from .conventions import (
+    AGREEMENT_KEYS,
     CONVENTIONS,
     DEPTH_KEYS,
     NORMAL_KEYS,
     Convention,
     SceneExtent,
+    claimed_masks,
     evaluation_masks,
     get_convention,
     missing_maps,
@@ -102,7 +104,7 @@ def score_scene(
         extent: :meth:`SceneExtent.of` both trajectories; None where no cameras are known, for conventions that have no
             depth limit.
         convention: a name that :func:`get_convention` knows.
-        within: ``(n, H, W)`` bool, only these of the convention's pixels count: those of
+        within: ``(n, H, W)`` bool, only these of the convention's pixels count, and are claimed: those of
             :func:`unghost.evaluation.curves.cut_to_coverage`, or that all compared methods have.
         network: of :func:`unghost.evaluation.perceptual.load_lpips`; without it LPIPS is None and noted.
         keys: metrics to compute, of those the convention defines; None: all that the maps allow, the others None and
@@ -115,13 +117,13 @@ def score_scene(
     """
     rule = get_convention(convention)
     check_match("score_scene", renders, truth)
-    masks = evaluation_masks(rule, renders, truth, extent)
+    masks, claimed = (find(rule, renders, truth, extent) for find in (evaluation_masks, claimed_masks))
     if within is not None:
         if within.dtype != np.bool_ or within.shape != masks.shape:
             raise ValueError(
                 f"score_scene: within must be bool of shape {masks.shape}, got {within.dtype} {within.shape}"
             )
-        masks &= within
+        masks, claimed = masks & within, claimed & within
     notes = _absent(rule, renders, truth, network)
     wanted = rule.keys if keys is None else tuple(keys)
     for key in wanted if keys is not None else ():
@@ -135,7 +137,7 @@ def score_scene(
         row: dict[str, Any] = {"name": name, "pixels": int(masks[index].sum()), **dict.fromkeys(rule.keys)}
         row.update(_image_scores(rule, renders, truth, masks[index], index, wanted, network, pixels_per_degree))
         row.update(_geometry_scores(rule, renders, truth, masks[index], index, wanted, extent))
-        row.update(_mask_columns(rule, truth, masks[index], index, wanted))
+        row.update(_mask_columns(rule, truth, masks[index], claimed[index], index, wanted))
         rows.append({key: _none_if_nan(value) for key, value in row.items()})
     used = network.backbone if network is not None and "lpips" in wanted else None
     return SceneScores(convention, tuple(rows), notes, used)
@@ -275,7 +277,9 @@ def _geometry_scores(
     return {key: value for key, value in result.items() if key in wanted}
 
 
-def _mask_columns(rule: Convention, truth: Truth, mask: Mask, index: int, wanted: Sequence[str]) -> dict[str, float]:
+def _mask_columns(
+    rule: Convention, truth: Truth, mask: Mask, claimed: Mask, index: int, wanted: Sequence[str]
+) -> dict[str, float]:
     result: dict[str, float] = {}
     visible = None if truth.visible is None else truth.visible[index]
     if "coverage" in wanted:
@@ -284,8 +288,9 @@ def _mask_columns(rule: Convention, truth: Truth, mask: Mask, index: int, wanted
         elif visible is not None:
             seen = int(visible.sum())
             result["coverage"] = int((mask & visible).sum()) / seen if seen else float("nan")
-    if "dice" in wanted and visible is not None:
-        result["dice"] = metrics.mask_scores(mask, visible)[rule.dice]
+    if visible is not None:
+        agreement = metrics.mask_scores(claimed, visible)
+        result |= {key: agreement[rule.dice if key == "dice" else key] for key in AGREEMENT_KEYS if key in wanted}
     return result
 
 

@@ -188,6 +188,10 @@ def _scene(
         truth = stored.truth(photos, occlusion=aware, minimum_views=min_views)
         told = {"masks": masks.name, "occlusion": aware, "min_views": min_views}
         return _Scene(truth, stored.extent, stored.eval_cameras, told)
+    for option, given in (("--occlusion", occlusion is not None), ("--min-views", min_views != 1)):
+        if given:
+            held = "no masks" if masks is None else f"the pictures in {masks}"
+            raise ValueError(f"evaluate: {option} needs --masks masks.npz (of unghost masks), got {held}")
     visible = None if masks is None else read_masks(masks, names, (height, width))
     notes: tuple[str, ...] = ()
     if cameras is not None and train_cameras is None:

@@ -54,10 +54,28 @@ def test_common_pixels_and_equal_coverage_by_hand():
     assert rows["whole"]["coverage_common"] == pytest.approx(0.25)
     at_quarter = next(each for each in rows["whole"]["curve"] if each["coverage"] == pytest.approx(0.25))
     upper = truth.visible[0] & (np.arange(SIZE[0]) < 8)[:, None]
-    wanted = [metrics.psnr(a, b, upper, data_range=1.0) for a, b in zip(whole.renders.colours, truth.photos)]
-    assert at_quarter["psnr"] == pytest.approx(np.mean(wanted))
+    every = np.broadcast_to(upper, (3, *SIZE))
+    pooled = metrics.psnr(whole.renders.colours[every][None], truth.photos[every][None],
+                          np.ones((1, every.sum()), dtype=bool), data_range=1.0)  # fmt: skip
+    assert at_quarter["psnr"] == pytest.approx(pooled)
     assert len(rows["whole"]["curve"]) == 10
     assert "curve" not in rows["less"]
+
+
+def test_giving_up_whole_views_is_not_rewarded_by_a_mean_over_the_views_that_are_left():
+    truth = scene(4)
+    colours, noise = truth.photos.copy(), (0.01, 0.05, 0.1, 0.2)
+    for view, each in enumerate(noise):
+        colours[view] += each
+    depth, sure = np.full((4, *SIZE), 2.0), np.broadcast_to(np.arange(4)[::-1, None, None], (4, *SIZE)).astype(float)
+    (row,) = run([Method("a", Renders(np.clip(colours, 0, 1), depth, np.ones_like(depth)), sure)], truth)["rows"]
+    by = {round(each["share_kept"], 2): each["psnr"] for each in row["curve"]}
+    kept = {1.0: (1, 1, 1, 1), 0.8: (1, 1, 1, 0.2), 0.5: (1, 1, 0, 0)}
+    exact = [np.mean((np.clip(colours[view], 0, 1) - truth.photos[view])[:, :10] ** 2) for view in range(4)]
+    for share, views in kept.items():  # .2 of the last view are those first in the picture: within a tenth of a dB
+        assert by[share] == pytest.approx(-10 * np.log10(np.average(exact, weights=views)), abs=0.1)
+    assert row["point"]["psnr"] == pytest.approx(by[1.0])
+    assert row["psnr"] == pytest.approx(np.mean(-10 * np.log10(exact)))
 
 
 def test_a_curve_meets_a_point_at_the_points_coverage():
@@ -99,7 +117,12 @@ def test_an_empty_mask_is_a_row_without_numbers_and_one_empty_view_is_left_out()
     assert rows["half"]["per_image"][1]["psnr"] is None
     values = [row["psnr"] for row in rows["half"]["per_image"] if row["psnr"] is not None]
     assert rows["half"]["psnr"] == pytest.approx(np.mean(values))
-    assert [row["metric"] for row in found["differences"]] == ["coverage", "dice"]  # defined for both, and no other
+    assert [row["metric"] for row in found["differences"]] == [
+        "coverage",
+        "dice",
+        "iou",
+        "mask_recall",
+    ]  # defined for both, and no other
     json.dumps(found, allow_nan=False)
 
 

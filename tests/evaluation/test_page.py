@@ -91,6 +91,15 @@ def test_hostile_names_are_text_everywhere():
     assert sum(HOSTILE in each for each in reader.text) > 10
 
 
+def test_lpips_on_two_backbones_is_two_columns_that_name_them():
+    found = [{"method": name, "convention": "proper", "lpips": value, "lpips_backbone": name}
+             for name, value in (("vgg", 0.5), ("alex", 0.25))]  # fmt: skip
+    text = score_table(found, ["lpips"])
+    assert re.findall(r"LPIPS \((\w+)\)", text) == ["vgg", "alex"]
+    assert re.findall(r"<td>(.*?)</td>", text) == ["0.500", "–", "–", "0.250"]
+    assert "LPIPS (" not in score_table([{"method": "a", "lpips": 0.5}], ["lpips"])
+
+
 def test_two_conventions_are_two_tables_and_one_table_refuses_both():
     second = {"method": "a", "convention": "paper_code", "psnr": 25.0, "coverage": 0.4}
     with pytest.raises(ValueError, match=r"'proper' \(row 'a'\) and 'paper_code' \(row 'a'\) must not stand in one"):

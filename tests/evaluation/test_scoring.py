@@ -78,7 +78,10 @@ def test_coverage_of_each(convention, wanted):
 def test_dice_and_what_was_published_under_its_name():
     renders, truth = _scene()
     proper = scoring.score_scene(renders, truth, EXTENT, convention="proper").means()
-    assert proper["dice"] == pytest.approx(2 * 120 / (120 + 160))
+    # claimed: 12 rows; visible: 10 columns; both: 12 x 10
+    assert proper["dice"] == pytest.approx(2 * 120 / (240 + 160))
+    assert proper["iou"] == pytest.approx(120 / (240 + 160 - 120))
+    assert (proper["mask_precision"], proper["mask_recall"]) == pytest.approx((0.5, 0.75))
     published = scoring.score_scene(renders, truth, EXTENT, convention="free_space_prior").means()
     # predicted: 12 rows; visible: 10 columns; they agree on 12 x 10 and on 4 x 10 of 320
     assert published["dice"] == pytest.approx((120 + 40) / 320)
@@ -141,7 +144,7 @@ def test_an_empty_mask_is_a_defined_row_and_no_nan_in_a_mean():
         found = scoring.score_scene(gone, truth, EXTENT, convention=convention, network=SQUARES)
         row = found.images[1]
         assert row["pixels"] == 0
-        assert all(row[key] is None for key in rule.keys if key not in ("coverage", "dice"))
+        assert all(row[key] is None for key in rule.keys if key not in ("coverage", "dice", "iou", "mask_recall"))
         assert row.get("coverage", 0) == 0
         means = found.means()
         if convention == "free_space_prior":

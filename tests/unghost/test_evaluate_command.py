@@ -209,7 +209,17 @@ def test_two_identical_trajectories_are_scored(renders, capture, capsys):
     assert run(*words, "--out", renders / "out") == 0
     (row,) = results(renders / "out")["rows"]
     assert row["convention"] == "proper"
-    assert row["dice"] == row["coverage"] > 0.99  # every view sees its own pixels
+    assert row["mask_precision"] == row["coverage"] > 0.99  # every view sees its own pixels
+    assert row["mask_recall"] == 1
+
+
+@pytest.mark.parametrize("words", [("--min-views", "3"), ("--occlusion", "False")])
+def test_options_of_masks_npz_are_refused_without_it(renders, capture, masks, capsys, words):
+    assert run(renders / "a", "--gt", capture, "--no-normalize", *words, "--out", renders / "out") == 2
+    assert f"{words[0]} needs --masks masks.npz (of unghost masks), got no masks" in capsys.readouterr().err
+    words = (*words, "--masks", masks)
+    assert run(renders / "a", "--gt", capture, "--no-normalize", *words, "--out", renders / "out") == 2
+    assert f"got the pictures in {masks}" in capsys.readouterr().err
 
 
 def test_lpips_that_cannot_be_had_leaves_the_other_columns(renders, capture, capsys, monkeypatch):
