@@ -112,15 +112,17 @@ def test_area_by_hand(bench):
 @pytest.mark.parametrize(
     ("ours", "rival", "said"),
     [
-        ((20.0, 22.0, 24.0), (19.0, 20.0, 23.5), "we win"),
-        ((19.0, 20.0, 23.5), (20.0, 22.0, 24.0), "we lose"),
-        ((20.0, 20.0, 26.0), (19.0, 21.0, 24.0), "we win, within chance"),
-        ((20.0, 22.0, 24.0), (20.0, 22.0, 24.0), "a tie"),
+        ((20.0, 22.0, 24.0) * 2, (19.0, 20.0, 23.5) * 2, "we win"),
+        ((19.0, 20.0, 23.5) * 2, (20.0, 22.0, 24.0) * 2, "we lose"),
+        ((20.0, 20.0, 26.0) * 2, (19.0, 21.0, 24.0) * 2, "we win, within chance"),
+        ((20.0, 22.0, 24.0) * 2, (20.0, 22.0, 24.0) * 2, "a tie"),
+        ((20.0, 22.0), (19.0, 20.0), "we win, on 2 scenes: too few to tell"),
+        ((20.0,), (21.0,), "we lose, on 1 scene: too few to tell"),
     ],
 )
 def test_the_verdict_counts_scenes_not_means(bench, ours, rival, said):
     page, cells = bench["trajectory_page"], []
-    for scene, first, second in zip("abc", ours, rival):
+    for scene, first, second in zip("abcdef", ours, rival):
         cells += [cell("clean", scene, 0.5, [(0.5, first)]), cell("field", scene, 0.5, [(0.5, second)])]
     rows = bench["trajectory_tables"].summary_rows(cells)
     (line,) = page.who_wins({"rows": rows, "cells": cells})
