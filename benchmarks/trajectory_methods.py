@@ -47,6 +47,10 @@ def _dsds_and_distortion(job: Job) -> list[Outcome]:
     return [_doubted(fine_tuned(job, make_regularizer, config=_distorting(job)))]
 
 
+def _dsds_and_tv(job: Job) -> list[Outcome]:
+    return [_doubted(fine_tuned(job, make_regularizer, total_variation(job)))]
+
+
 def restoration(job: Job, **over: Any) -> list[Outcome]:
     """Trained with DSDS; what stays is doubted by the photos."""
     return [_doubted(fine_tuned(job, lambda job: make_regularizer(job, **over)))]
@@ -167,6 +171,7 @@ METHODS: dict[str, Callable[[Job], list[Outcome]]] = {
     "dsds-paper": paper,
     "dsds-restoration": lambda job: [once(job, "dsds-restoration")],
     "dsds-restoration+distortion": _dsds_and_distortion,
+    "dsds-restoration+tv": _dsds_and_tv,
     "clean": lambda job: cleaned(job, job.base),
     "visibility+clean": _clean_after("visibility"),
     "dsds-restoration+clean": _clean_after("dsds-restoration"),

@@ -19,8 +19,8 @@ from unghost.evaluation.report import convention_rows
 
 ROOT = Path(__file__).resolve().parents[1]
 OURS = (
-    "photo-doubt", "dsds-restoration", "dsds-restoration+distortion", "clean", "visibility+clean",
-    "dsds-restoration+clean",
+    "photo-doubt", "dsds-restoration", "dsds-restoration+distortion", "dsds-restoration+tv", "clean",
+    "visibility+clean", "dsds-restoration+clean",
 )  # fmt: skip
 WATCHED = (*OURS, "bayes-rays", "visibility", "field")
 RESAMPLES = 2000

@@ -39,7 +39,7 @@ COLORS = {
     "visibility+bayes-rays": "#98df8a",
     "bayes-rays": "#2ca02c", "components": "#8c564b", "dsds-paper": "#f7b6d2",
     "dsds-restoration": "#d62728", "clean": "#ff7f0e", "visibility+clean": "#ffbb78",
-    "dsds-restoration+distortion": "#8b0000", "dsds-restoration+clean": "#ff9896",
+    "dsds-restoration+distortion": "#8b0000", "dsds-restoration+tv": "#e377c2", "dsds-restoration+clean": "#ff9896",
 }  # fmt: skip
 STRONG = ("visibility", "visibility+distortion", "bayes-rays", "dsds-restoration", "dsds-restoration+distortion",
           "clean")  # fmt: skip
