@@ -32,12 +32,12 @@ class Weights:
     One rule for all: the smallest disparity error of those whose PSNR at equal coverage is within .1 dB of the best.
     """
 
-    sparsity: float = 1e-3
+    sparsity: float = 1e-4
     tv: float = 1e-2
     regnerf: float = 1e-2
     distortion: float = 1e-1
-    free_space: float = 1e-4
-    bayes_rays: float = 0.9  # the threshold above which what is uncertain goes
+    free_space: float = 1e-5
+    bayes_rays: float = 0.8  # the threshold above which what is uncertain goes
 
 
 @dataclass(frozen=True, eq=False)

@@ -256,7 +256,7 @@ def test_the_factors_are_those_that_the_sweep_chose(bench):
     stored = json.loads((BENCHMARKS.parent / "docs" / "results" / "two_trajectory_sweep.json").read_text())
     chosen = {row["table"]: float(row["method"].split()[1]) for row in stored["rows"] if row.get("chosen")}
     weights = bench["trajectory_job"].Weights()
-    assert {loss: getattr(weights, loss) for loss in chosen} == chosen
+    assert chosen == {factor: getattr(weights, factor) for factor in importlib.import_module("trajectory_sweep").FACTORS}
 
 
 def test_every_eighth_photo_is_judged_from_where_it_was_taken(bench, monkeypatch):
