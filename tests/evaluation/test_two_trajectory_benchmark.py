@@ -255,8 +255,8 @@ def test_of_factors_that_cost_no_psnr_the_best_disparity_is_taken(bench):
 def test_the_factors_are_those_that_the_sweep_chose(bench):
     stored = json.loads((BENCHMARKS.parent / "docs" / "results" / "two_trajectory_sweep.json").read_text())
     chosen = {row["table"]: float(row["method"].split()[1]) for row in stored["rows"] if row.get("chosen")}
-    weights = bench["trajectory_job"].Weights()
-    assert chosen == {factor: getattr(weights, factor) for factor in importlib.import_module("trajectory_sweep").FACTORS}
+    weights, sweep = bench["trajectory_job"].Weights(), importlib.import_module("trajectory_sweep")
+    assert chosen == {factor: getattr(weights, factor) for factor in sweep.FACTORS}
 
 
 def test_every_eighth_photo_is_judged_from_where_it_was_taken(bench, monkeypatch):
