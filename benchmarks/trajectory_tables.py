@@ -32,14 +32,13 @@ FROM = 0.1  # coverage at which areas begin
 ORDERS = {"": "own", "_by_spread": "spread", "_by_photos": "photos", "_at_best": None}
 REFERENCE = "pseudo-gt"
 FEWER_SEEDS = (REFERENCE, "dsds-paper")
-COLORS = {
+COLORS = {  # in the order of the tables
     "pseudo-gt": "#bbbbbb", "fitted": "#888888", "field": "#444444", "visibility": "#1f77b4",
     "visibility+sparsity": "#9ecae1", "visibility+tv": "#17becf", "visibility+regnerf": "#74c476",
-    "visibility+distortion": "#9467bd", "free-space": "#e7ba52", "photo-doubt": "#bc80bd",
-    "visibility+bayes-rays": "#98df8a",
-    "bayes-rays": "#2ca02c", "components": "#8c564b", "dsds-paper": "#f7b6d2",
-    "dsds-restoration": "#d62728", "clean": "#ff7f0e", "visibility+clean": "#ffbb78",
-    "dsds-restoration+distortion": "#8b0000", "dsds-restoration+tv": "#e377c2", "dsds-restoration+clean": "#ff9896",
+    "visibility+distortion": "#9467bd", "free-space": "#e7ba52", "bayes-rays": "#2ca02c",
+    "visibility+bayes-rays": "#98df8a", "components": "#8c564b", "dsds-paper": "#f7b6d2", "photo-doubt": "#bc80bd",
+    "dsds-restoration": "#d62728", "dsds-restoration+distortion": "#8b0000", "dsds-restoration+tv": "#e377c2",
+    "clean": "#ff7f0e", "visibility+clean": "#ffbb78", "dsds-restoration+clean": "#ff9896",
 }  # fmt: skip
 STRONG = ("visibility", "visibility+distortion", "bayes-rays", "dsds-restoration", "dsds-restoration+distortion",
           "clean")  # fmt: skip
@@ -54,7 +53,7 @@ def summary_rows(cells: Sequence[Cell]) -> list[dict[str, Any]]:
     cells = finished(cells)
     equal = _at_equal_coverage(cells)
     rows = []
-    for table, method in dict.fromkeys((cell["table"], cell["method"]) for cell in cells):
+    for table, method in sorted(dict.fromkeys((cell["table"], cell["method"]) for cell in cells), key=_place):
         mine = [cell for cell in cells if (cell["table"], cell["method"]) == (table, method)]
         row: dict[str, Any] = {
             "method": method, "table": table, "convention": mine[0]["convention"],
@@ -74,6 +73,14 @@ def summary_rows(cells: Sequence[Cell]) -> list[dict[str, Any]]:
             row[f"psnr_at_{coverage:g}"] = _mean(mine, reached)[0] if every else None
         rows.append({**row, "intervals": intervals, "level": 0.95})
     return rows
+
+
+def _place(row: tuple[str, str]) -> tuple[bool, str, int]:
+    """Where a table's method stands: the main table first; methods that have no place of their own as they come."""
+    table, method = row
+    names = list(COLORS)
+    name = method.split(" @ ")[0]
+    return table != "main", table, names.index(name) if name in names else len(names)
 
 
 def _plain(cell: Cell, key: str) -> float | None:

@@ -88,6 +88,16 @@ def test_seeds_on_which_no_knob_was_turned_count(bench):
     assert rows["bold"]["at_coverage"] == pytest.approx(0.5)  # no bar is shared with another scene of that name
 
 
+def test_tables_have_one_order_whatever_was_run_first(bench):
+    tables, methods = bench["trajectory_tables"], bench["trajectory_methods"].METHODS
+    assert set(tables.COLORS) == {tables.REFERENCE, *methods}
+    names = ("other", "clean @ 0.3", "field", "clean", "pseudo-gt", "bayes-rays")
+    cells = [cell(name, "a", 0.5, [(0.5, 20.0)], psnr=20.0) for name in names]
+    cells = [{**cells[2], "table": "ablation"}, *cells]
+    in_order = ["pseudo-gt", "field", "bayes-rays", "clean @ 0.3", "clean", "other", "field"]
+    assert [row["method"] for row in tables.summary_rows(cells)] == in_order
+
+
 def test_a_run_with_less_coverage_than_curves_reach_counts_for_nobody(bench):
     cells = [
         cell("field", "a", 0.8, [(0.8, 18.0), (0.1, 21.0)]), cell("bold", "a", 0.05, [(0.05, 30.0)]),
