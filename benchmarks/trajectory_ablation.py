@@ -27,7 +27,7 @@ EDGES = {"1-10 %": (0.01, 0.1), "10-20 %": (0.1, 0.2), "1-20 %": (0.01, 0.2)}
 def through_activation(job: Job, how: Squash) -> list[Outcome]:
     """The paper's "why not just": SDS, with noise, through a clamp or a sigmoid; beside the visibility loss."""
     denoiser = load_denoiser(str(PAPER_PRIOR), backend="onnx", threads=job.threads)
-    settings = RegularizerSettings.paper(cubes=job.cubes, seed=job.seed)
+    settings = RegularizerSettings.paper(cubes=job.cubes, seed=job.seed, dsds_weight=job.weights.dsds_paper)
     regularizer = make_regularizer(job, denoiser=denoiser, settings=RegularizerSettings.paper(dsds_weight=0.0))
     cumulative = alphas_cumprod()
 
@@ -59,7 +59,8 @@ def _look(regularizer: Any, field: Any, rng: np.random.Generator) -> None:
 def by_weights(job: Job) -> list[Outcome]:
     """Cubes where the training photos' rays end: accumulation weights, observed once, fill the grid."""
     denoiser = load_denoiser(str(PAPER_PRIOR), backend="onnx", threads=job.threads)
-    regularizer = make_regularizer(job, denoiser=denoiser, settings=RegularizerSettings.paper(timestep=paper_timestep))
+    settings = RegularizerSettings.paper(timestep=paper_timestep, dsds_weight=job.weights.dsds_paper)
+    regularizer = make_regularizer(job, denoiser=denoiser, settings=settings)
     cameras, rng = job.scene.train.cameras, np.random.default_rng([job.seed, 18])
     with torch.no_grad():
         for index in range(len(cameras)):

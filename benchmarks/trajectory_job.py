@@ -38,6 +38,7 @@ class Weights:
     distortion: float = 1e-1
     free_space: float = 1e-5
     bayes_rays: float = 0.8  # the threshold above which what is uncertain goes
+    dsds_paper: float = 0.1  # of the paper's own loss
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +53,6 @@ class Outcome:
         knob: where the method's knob stood; None without one.
         uncertainty: ``positions -> (M,)``, the method's own, averaged along rays; None: how far a ray's depth spreads.
         background_uncertainty: of light that gets through.
-        uncertain: the field by whose weights ``uncertainty`` is averaged, if not ``field``.
         asks_photos: the method's own order of pixels is by photo doubt and how far the depth spreads.
         note: for the row.
     """
@@ -64,7 +64,6 @@ class Outcome:
     knob: float | None = None
     uncertainty: Callable[[Tensor], Tensor] | None = None
     background_uncertainty: float = 0.0
-    uncertain: Any = None
     asks_photos: bool = False
     note: str = ""
 
@@ -116,17 +115,13 @@ class Clock:
 def render(outcome: Outcome, scene: TrajectoryScene, cameras: Cameras, *, values: bool = True) -> Views:
     """``rgb (n, H, W, 3)``, ``depth``, ``accumulation``, ``spread``; with ``values``, the method's ``uncertainty``."""
 
-    def rendered(field: Any, asked: Any) -> Views:
-        views = [render_view(field, cameras, index, sampling=scene.sampling, values=asked)
-                 for index in range(len(cameras))]  # fmt: skip
-        return {key: np.stack([view[key] for view in views]) for key in views[0]}
-
     asked = outcome.uncertainty if values else None
-    stacked = rendered(outcome.field, asked if outcome.uncertain is None else None)
+    views = [render_view(outcome.field, cameras, index, sampling=scene.sampling, values=asked)
+             for index in range(len(cameras))]  # fmt: skip
+    stacked = {key: np.stack([view[key] for view in views]) for key in views[0]}
     if asked is not None:
-        doubted = stacked if outcome.uncertain is None else rendered(outcome.uncertain, asked)
-        through = 1.0 - doubted["accumulation"]
-        stacked["uncertainty"] = doubted.pop("values") + through * outcome.background_uncertainty
+        through = 1.0 - stacked["accumulation"]
+        stacked["uncertainty"] = stacked.pop("values") + through * outcome.background_uncertainty
     return stacked
 
 

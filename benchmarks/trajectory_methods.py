@@ -80,13 +80,14 @@ def paper_timestep(step: int) -> int:
 
 def paper(job: Job, **over: Any) -> list[Outcome]:
     denoiser = load_denoiser(str(PAPER_PRIOR), backend="onnx", threads=job.threads)
-    settings = RegularizerSettings.paper(timestep=paper_timestep, **over)
-    note = "the paper's loss, cubes, schedule and objective; a network of .29 M parameters (7.2 M need a GPU to train)"
+    settings = RegularizerSettings.paper(timestep=paper_timestep, dsds_weight=job.weights.dsds_paper, **over)
+    note = (f"the paper's loss, schedule and objective, and its kind of cubes; {job.cubes} of them a step, as for ours "
+            "(the paper: 40); a network of .29 M parameters (7.2 M need a GPU to train)")  # fmt: skip
     return [fine_tuned(job, lambda job: make_regularizer(job, denoiser=denoiser, settings=settings), note=note)]
 
 
 def bayes_rays(job: Job, base: Any) -> list[Outcome]:
-    """Of a field at each threshold; pixels are ranked by the uncertainty of what is there before anything goes."""
+    """Of a field at each threshold; pixels are ranked by the uncertainty of what stays, as in the published code."""
     clock = Clock()
     told = job.scene.train
     found = deformation_uncertainty(
@@ -97,8 +98,8 @@ def bayes_rays(job: Job, base: Any) -> list[Outcome]:
     mine = job.weights.bayes_rays
     return [
         Outcome(
-            FilteredField(base, found.keep(threshold)), **took, knob=threshold, uncertain=base,
-            uncertainty=found.log_deviation, background_uncertainty=LOWEST,
+            FilteredField(base, found.keep(threshold)), **took, knob=threshold, uncertainty=found.log_deviation,
+            background_uncertainty=LOWEST,
         )
         for threshold in (mine, *(each for each in UNCERTAINTY_THRESHOLDS if each != mine))
     ]  # fmt: skip
@@ -176,4 +177,9 @@ METHODS: dict[str, Callable[[Job], list[Outcome]]] = {
     "visibility+clean": _clean_after("visibility"),
     "dsds-restoration+clean": _clean_after("dsds-restoration"),
 }
+FACTOR_OF = {
+    **{f"visibility+{name}": name for name in ("sparsity", "tv", "regnerf", "distortion")},
+    "free-space": "free_space", "bayes-rays": "bayes_rays", "visibility+bayes-rays": "bayes_rays",
+    "dsds-paper": "dsds_paper", "dsds-restoration+distortion": "distortion", "dsds-restoration+tv": "tv",
+}  # fmt: skip
 UNTRAINED = ("fitted", "photo-doubt", "bayes-rays", "components", "clean")  # equal seconds say nothing of them

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from trajectory_tables import KEYS, ORDERS, REFERENCE, format_rows, main_rows, per_scene, summary_rows, write_figures
+from trajectory_figure import write_figures
+from trajectory_tables import KEYS, ORDERS, REFERENCE, format_rows, main_rows, per_scene, summary_rows
 
 from unghost.evaluation.conventions import get_convention
 from unghost.evaluation.intervals import Interval, bootstrap_difference

@@ -4,12 +4,14 @@
 
 All factors of a loss are cut to the lowest coverage among them; of those whose PSNR is there within .1 dB of the best,
 the one with the smallest disparity error is ``chosen``, mean over the scenes. Writes
-docs/results/two_trajectory_sweep.json, off which ``Weights`` in ``trajectory_job.py`` is read.
+docs/results/two_trajectory_sweep.json, off which ``Weights`` in ``trajectory_job.py`` is read; losses that are not
+asked for stay there as they were.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +21,7 @@ import torch
 import tyro
 from fit_cache import FitCache, say
 from trajectory_job import Job, Weights
-from trajectory_methods import METHODS
+from trajectory_methods import FACTOR_OF, METHODS
 from trajectory_scenes import synthetic_scene
 from trajectory_scores import Stage, scored
 from trajectory_tables import summary_rows
@@ -33,9 +35,9 @@ ROOT = Path(__file__).resolve().parents[1]
 FACTORS = {
     "sparsity": (1e-4, 1e-3, 1e-2, 1e-1), "tv": (1e-3, 1e-2, 1e-1, 1.0), "regnerf": (1e-3, 1e-2, 1e-1, 1.0),
     "distortion": (4e-3, 2e-2, 1e-1, 5e-1), "free_space": (1e-6, 1e-5, 1e-4, 1e-3), "bayes_rays": (0.6, 0.7, 0.8, 0.9),
+    "dsds_paper": (1e-2, 1e-1, 1.0, 10.0),
 }  # fmt: skip
 WITHIN_DB = 0.1
-ROWS = {"free_space": "free-space", "bayes_rays": "bayes-rays"}
 
 
 @dataclass(frozen=True)
@@ -83,9 +85,10 @@ def main() -> None:
         stage = Stage(scene, pseudo, scene.truth(pseudo), options.fit_steps, options.steps)
         base, _ = fitted(Benchmark(), cache, "field", scene, scene.train, 0, options.fit_steps)
         for loss in options.losses:
-            method = METHODS[ROWS.get(loss, f"visibility+{loss}")]
+            method = METHODS[next(name for name, factor in FACTOR_OF.items() if factor == loss)]
             for factor in FACTORS[loss]:
-                job = Job(scene, base, 0, options.steps, weights=dataclasses.replace(Weights(), **{loss: factor}))
+                weights = dataclasses.replace(Weights(), **{loss: factor})
+                job = Job(scene, base, 0, options.steps, threads=options.threads, weights=weights)
                 row = scored(stage, method(job)[0], None, headline=False)
                 cells.append({"table": loss, "scene": name, "seed": 0, "method": f"{factor:g}", **row})
                 say(f"{name} {loss} {factor:g}: psnr {row['psnr']:.2f} coverage {row['coverage']:.3f} "
@@ -97,9 +100,14 @@ def main() -> None:
         row["method"] = f"{row['table']} {row['method']}"
         say(f"{row['method']}: {row['psnr_at_coverage']:.3f} dB at {row['at_coverage']:.3f}, disparity "
             f"{row['disparity_mae_at_coverage']:.4f}{' *' * row['chosen']}")  # fmt: skip
+    path = options.out / "two_trajectory_sweep.json"
+    stored = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"rows": []}
+    rows = [row for row in stored["rows"] if row["table"] not in options.losses] + rows
     command = f"python benchmarks/trajectory_sweep.py --scenes {' '.join(options.scenes)}"
+    if options.losses != tuple(FACTORS):
+        command = f"{stored.get('command', '')} ; {command} --losses {' '.join(options.losses)}"
     results = build_results(rows, command=command, seeds=[0], scene_seed=options.scene_seed, threads=options.threads)
-    write_results(options.out / "two_trajectory_sweep.json", json_ready(results))
+    write_results(path, json_ready(results))
 
 
 if __name__ == "__main__":

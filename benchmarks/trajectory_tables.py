@@ -1,4 +1,4 @@
-"""Means, tables and figures of the two-trajectory benchmark, from its finished rows.
+"""Means and tables of the two-trajectory benchmark, from its finished rows.
 
 ``psnr_at_coverage`` and its like compare methods on a scene and seed where every one of them is cut to the lowest
 coverage among them, each at its own setting and in its own order of pixels; ``_by_spread`` and ``_by_photos``: all in
@@ -9,9 +9,7 @@ race. Between two measured coverages a score is interpolated linearly (``evaluat
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,7 +29,7 @@ FIXED = (0.3, 0.4, 0.5)
 FROM = 0.1  # coverage at which areas begin
 ORDERS = {"": "own", "_by_spread": "spread", "_by_photos": "photos", "_at_best": None}
 REFERENCE = "pseudo-gt"
-FEWER_SEEDS = (REFERENCE, "dsds-paper")
+FEWER_SEEDS = (REFERENCE,)
 COLORS = {  # in the order of the tables
     "pseudo-gt": "#bbbbbb", "fitted": "#888888", "field": "#444444", "visibility": "#1f77b4",
     "visibility+sparsity": "#9ecae1", "visibility+tv": "#17becf", "visibility+regnerf": "#74c476",
@@ -40,8 +38,6 @@ COLORS = {  # in the order of the tables
     "dsds-restoration": "#d62728", "dsds-restoration+distortion": "#8b0000", "dsds-restoration+tv": "#e377c2",
     "clean": "#ff7f0e", "visibility+clean": "#ffbb78", "dsds-restoration+clean": "#ff9896",
 }  # fmt: skip
-STRONG = ("visibility", "visibility+distortion", "bayes-rays", "dsds-restoration", "dsds-restoration+distortion",
-          "clean")  # fmt: skip
 Cell = dict[str, Any]
 
 
@@ -180,43 +176,6 @@ def main_rows(results: dict[str, Any], table: str) -> list[dict[str, Any]]:
     return [row for row in results["rows"] if row["table"] == table and "@" not in row["method"]]
 
 
-def write_figures(path: Path) -> None:
-    """Curves of all methods, averaged over the runs that reach a coverage, beside the points of the main table."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    results = json.loads(path.read_text(encoding="utf-8"))
-    rows = [row for row in main_rows(results, "main") if row["coverage"]]
-    if not rows:
-        return
-    figure = Figure(figsize=(13, 5.4), facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
-    for axes, key, label in zip(
-        figure.subplots(1, 2), ("psnr", "disparity_mae"), ("PSNR, dB (higher is better)", "disparity error (lower)")
-    ):
-        for row in rows:
-            strong, color = row["method"] in STRONG, COLORS.get(row["method"], "#888888")
-            points = mean_curve(results["cells"], row["method"], key)
-            if points:
-                axes.plot(*zip(*points), linewidth=2.4 if strong else 1.1, label=row["method"], color=color)
-            if row["coverage"] and row[key]:
-                axes.plot(row["coverage"], row[key], "o", color=color, markersize=7 if strong else 4)
-        shown = [line for line in axes.lines if line.get_color() != COLORS[REFERENCE]]
-        values = np.concatenate([np.asarray(line.get_ydata(), dtype=float) for line in shown]) if shown else [0.0, 1.0]
-        margin = 0.08 * (np.max(values) - np.min(values)) + 1e-6
-        axes.set_ylim(np.min(values) - margin, np.max(values) + margin)  # the reference may lie beyond
-        axes.set_xlabel("coverage: share of all pixels that are scored")
-        axes.set_ylabel(label)
-        axes.grid(alpha=0.25)
-        axes.spines[["top", "right"]].set_visible(False)
-    figure.axes[0].legend(fontsize=8, frameon=False, ncols=2)
-    scenes, runs = sorted({name for row in rows for name in row["scenes"]}), max(row["runs"] for row in rows)
-    figure.suptitle(
-        f"Score over coverage, mean of {len(scenes)} scenes ({runs} runs a method at most); dots: uncut", fontsize=12
-    )
-    figure.savefig(path.with_suffix(".png"), dpi=110, metadata={"Software": None})
-
-
 def per_scene(cells: Sequence[Cell], methods: Sequence[str], key: str) -> dict[str, dict[str, float]]:
     """Method -> scene -> mean over the seeds of the main table, of anything that a row has; undefined ones are left
     out."""
@@ -231,15 +190,3 @@ def per_scene(cells: Sequence[Cell], methods: Sequence[str], key: str) -> dict[s
                 values.setdefault(cell["scene"], []).append(found)
         result[method] = {scene: float(np.mean(each)) for scene, each in values.items()}
     return result
-
-
-def mean_curve(cells: Sequence[Cell], method: str, key: str) -> list[tuple[float, float]]:
-    """(coverage, mean) at coverages that every run of a method reaches."""
-    cells = [cell for cell in finished(cells) if cell["table"] == "main"]
-    mine = [cell for cell in cells if cell["method"] == method]
-    found = []
-    for coverage in np.round(np.arange(0.1, 1.0, 0.05), 2):
-        values = [score_at(cells, cell, key, float(coverage)) for cell in mine]
-        if values and all(value is not None for value in values):
-            found.append((float(coverage), float(np.mean([value for value in values if value is not None]))))
-    return found

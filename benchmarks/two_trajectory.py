@@ -34,13 +34,14 @@ import tyro
 from fit_cache import FitCache, Plan, say
 from numpy.typing import NDArray
 from trajectory_ablation import ABLATION
-from trajectory_job import Job, Outcome
-from trajectory_methods import METHODS, UNTRAINED
+from trajectory_figure import write_figures
+from trajectory_job import Job, Outcome, Weights
+from trajectory_methods import FACTOR_OF, METHODS, UNTRAINED
 from trajectory_scenes import LabelledSpace, Sweep, TrajectoryScene, captured_scene, synthetic_scene
 from trajectory_scores import CONVENTION, Stage, scored
-from trajectory_tables import FEWER_SEEDS, REFERENCE, summary_rows, write_figures
+from trajectory_tables import FEWER_SEEDS, REFERENCE, summary_rows
 
-from unghost.core.results import build_results, write_results
+from unghost.core.results import build_results, commit, write_results
 from unghost.evaluation.difficulty import difficulty_rows
 from unghost.evaluation.protocol import json_ready
 from unghost.fields.radiance import RadianceConfig, RadianceField
@@ -150,7 +151,11 @@ class Ledger:
     def key(self, stage: Stage, seed: int, method: str) -> dict[str, Any]:
         """What a row is known by."""
         named = {"table": self.options.table(), "scene": stage.scene.name, "seed": seed, "method": method}
-        return {**named, "steps": stage.steps, "fit_steps": stage.fit_steps, "scene_seed": self.options.scene_seed}
+        swept = FACTOR_OF.get("dsds-paper" if method.startswith("paper, ") else method)
+        return {
+            **named, "factor": getattr(Weights(), swept) if swept else None, "steps": stage.steps,
+            "fit_steps": stage.fit_steps, "scene_seed": self.options.scene_seed,
+        }  # fmt: skip
 
     def has(self, key: dict[str, Any]) -> bool:
         """Whether that row is finished."""
@@ -176,7 +181,7 @@ class Ledger:
 
     def add(self, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
         """Keep rows; as they were written."""
-        ready = [json_ready({**row, "threads": self.options.threads}) for row in rows]
+        ready = [json_ready({**row, "threads": self.options.threads, "commit": commit()}) for row in rows]
         with self.alone():
             self.cells += ready
             self.write()
@@ -239,12 +244,12 @@ def rows_of(key: dict[str, Any], stage: Stage, outcomes: list[Outcome], space: L
 
 
 def run_stage(options: Options, stage: Stage, cache: FitCache, ledger: Ledger, plan: Plan) -> None:
-    """All seeds and methods of one scene."""
+    """All seeds and methods of one scene; of a capture the truth is the reference itself, which is not scored."""
     scene = stage.scene
     ledger.describe(stage)
     table: dict[str, Callable[[Job], list[Outcome]]] = ABLATION if options.ablation else METHODS
     for seed in options.seeds:
-        names = options.names(seed)
+        names = [name for name in options.names(seed) if name != REFERENCE or scene.photographed is not None]
         keys = {name: ledger.key(stage, seed, name) for name in names}
         job: Job | None = None
         space: LabelledSpace | None = None
@@ -260,7 +265,7 @@ def run_stage(options: Options, stage: Stage, cache: FitCache, ledger: Ledger, p
             if name == REFERENCE:
                 both = scene.train.joined(scene.evaluation)
                 better, seconds = fitted(options, cache, "pseudo", scene, both, seed, stage.fit_steps)
-                outcomes = [Outcome(better, seconds)]
+                outcomes = [Outcome(better, seconds, seconds * options.threads)]
             else:
                 outcomes = table[name](job)
             outcomes = outcomes[:1] if seed > 0 else outcomes  # other settings of a knob are looked at once
