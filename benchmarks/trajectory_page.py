@@ -11,11 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import sem, t
 from trajectory_figure import write_figures
-from trajectory_tables import KEYS, ORDERS, REFERENCE, format_rows, main_rows, per_scene, summary_rows
+from trajectory_tables import KEYS, ORDERS, REFERENCE, finished, format_rows, main_rows, per_scene, summary_rows
 
 from unghost.evaluation.conventions import get_convention
-from unghost.evaluation.intervals import Interval, bootstrap_difference
+from unghost.evaluation.intervals import Interval
 from unghost.evaluation.report import convention_rows
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -23,14 +24,29 @@ OURS = (
     "photo-doubt", "dsds-restoration", "dsds-restoration+distortion", "dsds-restoration+tv", "clean",
     "visibility+clean", "dsds-restoration+clean",
 )  # fmt: skip
-WATCHED = (*OURS, "bayes-rays", "visibility", "field")
-RESAMPLES = 2000
-ENOUGH = 6  # scenes: a bootstrap over fewer never leaves the range of what it saw
+NOTHING_OF_OURS = "photo-doubt"  # but the order of pixels: where all have the same, it is the field as it was fitted
+WATCHED = ("dsds-restoration", "clean")
+ENOUGH = 6  # scenes
+ROWS = {
+    "pseudo-gt": "a field fitted to both sweeps, which has seen what it is scored on; not scored on the capture, whose "
+    "depth, normals and visibility it gives",
+    "fitted": "the field as it was fitted; all others go on from it",
+    "field": "as many steps more, by the photos alone",
+    "visibility": "with the paper's visibility loss, as all that follow but `free-space`, `bayes-rays`, `components`, "
+    "`photo-doubt` and `clean`",
+    "free-space": "the free-space prior of Optimize the Unseen, without the visibility loss, whose rival it is",
+    "bayes-rays": "our own implementation of Bayes' Rays: what it is unsure of is filtered out of `fitted`",
+    "components": "all but the largest connected piece goes from `fitted`",
+    "dsds-paper": "the paper's method, with the paper's thresholds and a diffusion trained here",
+    "photo-doubt": "ours: `fitted`, nothing but the order of pixels changed",
+    "dsds-restoration": "ours: score distillation with the shipped restoration prior",
+    "clean": "ours: `unghost.clean` on `fitted`, or after another method (`…+clean`)",
+}
 PLAIN = {
-    "psnr_at_coverage": ("masked PSNR at equal coverage", "dB", 1, 2),
-    "psnr_area": ("masked PSNR, mean over equal coverages", "dB", 1, 2),
-    "psnr_area_by_photos": ("masked PSNR, that mean, if all are cut by photo doubt", "dB", 1, 2),
-    "psnr_area_by_spread": ("masked PSNR, that mean, if all are cut by the spread of the depth", "dB", 1, 2),
+    "psnr_at_coverage": ("masked PSNR at equal coverage", " dB", 1, 2),
+    "psnr_area": ("masked PSNR, mean over equal coverages", " dB", 1, 2),
+    "psnr_area_by_photos": ("masked PSNR, that mean, if all are cut by photo doubt", " dB", 1, 2),
+    "psnr_area_by_spread": ("masked PSNR, that mean, if all are cut by the spread of the depth", " dB", 1, 2),
     "ssim_at_coverage": ("masked SSIM at equal coverage", "", 1, 3),
     "ssim_area": ("masked SSIM, mean over equal coverages", "", 1, 3),
     "disparity_mae_at_coverage": ("disparity error at equal coverage", "", -1, 3),
@@ -44,33 +60,30 @@ OTHER_TABLES = {
     "equal seconds": "At equal seconds (what `clean` and `photo_doubt` take comes on top)",
     "ablation": "The paper's ablation",
 }
+CUTS = tuple(order for order, known in ORDERS.items() if known)
 Row = dict[str, Any]
 
 
 def who_wins(results: dict[str, Any]) -> list[str]:
-    """A line a score: who is best, whether that is more than chance, and which place the others have."""
-    rows = main_rows(results, "main")
-    most = max(row["runs"] for row in rows)
-    methods = [row for row in rows if row["method"] != REFERENCE and row["runs"] == most]
-    lines = []
+    """A line a score: who is best of ours and of the rivals, and whether the difference is more than chance."""
+    methods = [row for row in main_rows(results, "main") if row["method"] != REFERENCE]
+    head = ("score", "", "our best", "best rival", "ours is better by (95 %)", *(f"`{name}`" for name in WATCHED))
+    lines = [f"| {' | '.join(head)} |", "| --- |" + " --- |" * (len(head) - 1)]
     for key, (name, unit, sign, digits) in PLAIN.items():
         known = sorted((row for row in methods if row.get(key) is not None), key=lambda row: -sign * row[key])
-        ours = [row for row in known if row["method"] in OURS]
+        one_order = "_by_" in key or key == "free_space_error"
+        ours = [row for row in known if row["method"] in OURS and not (one_order and row["method"] == NOTHING_OF_OURS)]
         rivals = [row for row in known if row["method"] not in OURS]
         if not ours or not rivals:
             continue
-        values = {row["method"]: f"{row[key]:.{digits}f}{' dB' if unit == 'dB' else unit}" for row in known}
-        places = {row["method"]: 1 + sum(sign * other[key] > sign * row[key] for other in known) for row in known}
-        first, second = ours[0], rivals[0]
-        apart = difference(results["cells"], first["method"], second["method"], key, sign)
-        named = (first["method"], second["method"])
-        said = [f"`{method}` {values[method]} (place {places[method]} of {len(known)})"
-                for method in WATCHED if method in values and method not in named]  # fmt: skip
-        lines.append(
-            f"- **{name[0].upper()}{name[1:]}: {verdict(apart)}.** Our best, `{first['method']}`, has "
-            f"{values[first['method']]}, the best rival, `{second['method']}`, {values[second['method']]}. "
-            f"{', '.join(said)}."
-        )
+        apart = difference(results["cells"], ours[0]["method"], rivals[0]["method"], key, sign)
+        best = [f"`{row['method']}` {row[key]:.{digits}f}{unit}" for row in (ours[0], rivals[0])]
+        by = f"{apart.mean:.{digits}f}" if apart.mean is not None else "–"
+        if apart.low is not None:
+            by += f" ({apart.low:.{digits}f} to {apart.high:.{digits}f})"
+        places = {row["method"]: f"{row[key]:.{digits}f}, place {place}" for place, row in enumerate(known, 1)}
+        watched = [places.get(method, "–") for method in WATCHED]
+        lines.append(f"| {' | '.join([name, f'**{verdict(apart)}**', *best, by, *watched])} |")
     return lines
 
 
@@ -85,11 +98,14 @@ def verdict(apart: Interval) -> str:
 
 
 def difference(cells: list[Row], ours: str, rival: str, key: str, sign: int) -> Interval:
-    """How much better ours is, over the scenes' means, with a bootstrap interval over scenes."""
+    """How much better ours is, over the scenes' means; Student's t, as a bootstrap of so few scenes is too sure."""
     found = per_scene(cells, (ours, rival), key)
     common = [name for name in found[ours] if name in found[rival]]
-    pairs = [[sign * found[method][name] for name in common] for method in (ours, rival)]
-    return bootstrap_difference(*pairs, np.random.default_rng(0), resamples=RESAMPLES)
+    values = np.array([sign * (found[ours][name] - found[rival][name]) for name in common])
+    if len(values) < 2:
+        return Interval(float(values.mean()) if len(values) else None, None, None, 0.95, len(values), 0)
+    mean, half = float(values.mean()), float(sem(values) * t.ppf(0.975, len(values) - 1))
+    return Interval(mean, mean - half, mean + half, 0.95, len(values), 0)
 
 
 PICTURES = {
@@ -106,49 +122,46 @@ def picture_lines(folder: Path) -> list[str]:
 
 def page(results: dict[str, Any], folder: Path) -> str:
     """The whole text; ``folder``: where it will stand, beside its pictures."""
-    cells, rows = results["cells"], main_rows(results, "main")
-    scenes = list(dict.fromkeys(cell["scene"] for cell in cells if cell["table"] == "main"))
-    seeds = sorted({cell["seed"] for cell in cells if cell["table"] == "main"})
+    cells, rows = finished(results["cells"]), main_rows(results, "main")
+    main = [cell for cell in cells if cell["table"] == "main"]
+    scenes = list(dict.fromkeys(cell["scene"] for cell in main))
     text = [
         "# Who takes ghosts out?", "",
-        "Written by `python benchmarks/trajectory_page.py` from two_trajectory.json, which "
-        f"`{results['command']}` made (commit {results['commit'][:7]}).", "",
-        f"A field is fitted to one sweep of photos and scored on another: {len(scenes)} scenes ({', '.join(scenes)}), "
-        f"seeds {', '.join(map(str, seeds))}; all that trains does so for equally many steps. Synthetic scenes have "
-        "exact depth, normals and visibility, and every place in them is known to be surface or air. The scores' "
-        "convention is `proper` ([what that is](../evaluation.md)); means are over scenes (the JSON has 95 % "
-        "intervals of a bootstrap over scenes).", "",
+        f"A field is fitted to one sweep of photos and scored on another: {len(scenes)} scenes "
+        f"({', '.join(scenes)}); all that trains does so for equally many steps. Synthetic scenes have exact depth, "
+        "normals and visibility, and of most places in them it is known whether they are surface or air; of a capture "
+        "nothing is known but the photos, and a field fitted to both sweeps stands for the rest, as in the paper. The "
+        "scores' convention is `proper` ([what that is](../evaluation.md)); means are over scenes, of each scene over "
+        "its seeds.", "",
         "**Equal coverage.** Whoever removes more is scored on easier pixels. So every method is cut to the lowest "
         "coverage among all of them on that scene, giving up first the pixels of which it is least sure: `bayes-rays` "
-        "by its own uncertainty (of the field before anything is taken out of it); ours by how far the training "
-        "photos contradict the pixel (`photo_doubt`) and by how far the depth along the ray spreads; whoever has no "
-        "such thing by that spread alone. All kept pixels of a scene count alike. **Mean over equal coverages**: the "
-        "same at every coverage from .1 up to that lowest one (`…_area`), for a viewer who would rather see less and "
-        "trust it.", "",
-        "`photo_doubt` asks for nothing but renders and the photos, so anybody may cut by it, and the row "
-        "`photo-doubt` is the field as it was fitted with that order and nothing else. What a method is worth beside "
-        "its order is said by the scores where *all* are cut by photo doubt.", "",
+        "by its own uncertainty; ours by how far the training photos contradict the pixel (`photo_doubt`) and by how "
+        "far the disparity along the ray spreads; whoever has no such thing by how far the depth spreads. All kept "
+        "pixels of a scene count alike. **Mean over equal coverages**: the same at every coverage from .1 up to that "
+        "lowest one (`…_area`), for a viewer who would rather see less and trust it.", "",
+        "`photo_doubt` asks for nothing but renders and the photos, so anybody may cut by it. What a method is worth "
+        "beside its order is said by the scores where *all* are cut by photo doubt.", "",
         "## In plain words", "", *who_wins(results), "",
-        "A verdict is \"within chance\" if the 95 % interval of the difference over the scenes holds 0; each side "
-        "sends its best of several for each score, which flatters both. Angles of normals get none: between "
+        "\"Within chance\": the 95 % interval of the difference over the scenes (Student's t) holds 0. Each side "
+        "sends its best of several for each score, which flatters both. Angles of normals get no verdict: between "
         "neighbouring pixels of renders this small the depth is noise, as the row of "
-        f"`{REFERENCE}` shows.", "", *picture_lines(folder), *scene_lines(results), "",
+        f"`{REFERENCE}` shows.", "",
+        "What the rows are:", "", *(f"- `{name}`: {said}." for name, said in ROWS.items()), "",
+        *picture_lines(folder), *scene_lines(results, main), "",
         "## At equal coverage", "",
         format_rows(rows, ("at_coverage", "psnr_at_coverage", "ssim_at_coverage", "disparity_mae_at_coverage",
                            "normal_mean_deg_at_coverage", "psnr_area", "ssim_area", "disparity_mae_area")), "",
         "![score over coverage](two_trajectory.png)", "",
         "## How much of that is the order in which pixels are given up?", "",
         "The same renders, cut in each method's own order, all by the spread of the depth, all by what the photos "
-        "say, and with the order and the knob that turn out best for the method on that scene (with an eye on the "
-        "truth: nobody can have that).", "",
-        format_rows(rows, tuple(f"psnr_at_coverage{order}" for order in ORDERS)
-                    + tuple(f"{key}_area{order}" for key in ("psnr", "disparity_mae")
-                            for order in ("", "_by_spread", "_by_photos"))), "",
+        "say.", "",
+        format_rows(rows, tuple(f"psnr_at_coverage{order}" for order in CUTS)
+                    + tuple(f"{key}_area{order}" for key in ("psnr", "disparity_mae") for order in CUTS)), "",
         "## As the paper's table has it, each method at its own coverage", "",
         format_rows(rows, ("psnr", "ssim", "flip", "depth_mse", "disparity_mae", "normal_mean_deg", "normal_median_deg",
                            "normal_pct_30", "coverage", "psnr_visible", "seconds", "cpu_seconds")), "",
         f"`seconds` by the clock with {results['threads']} thread{'s' * (results['threads'] > 1)} of two cores, "
-        "`cpu_seconds` of all threads together; ours with the photo doubt of the scored views.",
+        "`cpu_seconds` of all threads together; ours with the photo doubt of the scored views. "
         "`psnr_visible` is over all pixels that a training photo saw, whatever is rendered there: nothing is won by "
         "removing. LPIPS needs weights that were not to be had; FLIP is the perceptual measure without any.", "",
         "## What is known of every place (synthetic scenes)", "",
@@ -156,45 +169,71 @@ def page(results: dict[str, Any], folder: Path) -> str:
                            "ause_by_spread", "ause_by_photos")), "",
         "`floater_recall`: of what was opaque in the air, no longer opaque. `ause`: how badly an order of pixels (the "
         "method's own, by spread, by photos) ranks depth errors among those that it is scored on; 0 is perfect.", "",
+        *knob_lines(main), *convention_lines(main),
     ]  # fmt: skip
-    knobs = [row for row in results["rows"] if row["table"] == "main" and "@" in row["method"]]
-    if knobs:
-        text += ["## Knobs", "", format_rows(knobs, ("psnr", "disparity_mae", "coverage", "floater_recall",
-                                                     "surface_kept")), ""]  # fmt: skip
-    text += convention_lines(cells)
     for table, heading in OTHER_TABLES.items():
         if other := main_rows(results, table):
-            text += [f"## {heading}", "", format_rows(other, ("psnr", "ssim", "disparity_mae", "normal_mean_deg",
-                     "coverage", "psnr_at_coverage", "floater_recall", "surface_kept", "seconds")), ""]  # fmt: skip
-    return "\n".join(text + notes(rows))
+            named = ", ".join(other[0]["scenes"])
+            text += [f"## {heading}", "", f"{named}; seed 0.", "",
+                     format_rows(other, ("psnr", "ssim", "disparity_mae", "coverage", "psnr_at_coverage_by_spread",
+                                         "psnr_at_coverage_by_photos", "psnr_area_by_photos",
+                                         "disparity_mae_area_by_photos", "floater_recall", "surface_kept",
+                                         "seconds")), ""]  # fmt: skip
+    return "\n".join(text + notes(rows) + provenance(results))
 
 
-def scene_lines(results: dict[str, Any]) -> list[str]:
-    """How hard each scene is."""
+def knob_lines(main: list[Row]) -> list[str]:
+    """Methods with a knob at all its settings, on the seed on which they were tried."""
+    rows = [row for row in summary_rows([cell for cell in main if cell["seed"] == 0]) if row["coverage"] is not None]
+    turned = {row["method"].split(" @ ")[0] for row in rows if "@" in row["method"]}
+    shown = [row for row in rows if row["method"].split(" @ ")[0] in turned]
+    keys = ("psnr", "disparity_mae", "coverage", "floater_recall", "surface_kept", "psnr_at_coverage",
+            "psnr_at_coverage_at_best")  # fmt: skip
+    said = ("Seed 0. The row without a number stands in the tables. `…_at_best`: with the knob and the order that turn "
+            "out best on each scene, which takes an eye on the truth: nobody can have that.")  # fmt: skip
+    return ["## Knobs", "", said, "", format_rows(shown, keys), ""] if shown else []
+
+
+def provenance(results: dict[str, Any]) -> list[str]:
+    """Which commands made the numbers, at which commits."""
+    commits = sorted({cell.get("commit", "?")[:7] for cell in results["cells"]})
+    return ["## Where this is from", "", "Written by `python benchmarks/trajectory_page.py` from two_trajectory.json, "
+            f"rows made at the commits {', '.join(commits)} by", "", "```", *results["command"].split(" ; "), "```",
+            ""]  # fmt: skip
+
+
+def scene_lines(results: dict[str, Any], main: list[Row]) -> list[str]:
+    """How hard each scene is, and the seeds that are finished."""
     known = results.get("scenes", {}).get("main", {})
-    if not known:
-        return []
-    head = ["scene", "photos to train on", "scored", "to the nearest photo", "turned by", "pixels that it saw"]
-    lines = [f"| {' | '.join(head)} |", "| --- |" + " --- |" * 5]
-    for name, each in known.items():
+    seeds = {name: sorted({cell["seed"] for cell in main if cell["scene"] == name}) for name in known}
+    head = ["scene", "seeds", "photos to train on", "scored", "to the nearest photo", "turned by", "pixels that it saw"]
+    lines = [f"| {' | '.join(head)} |", "| --- |" + " --- |" * (len(head) - 1)]
+    for name in (name for name in sorted(known) if seeds[name]):
+        each = known[name]
         lines.append(
-            f"| {name} | {each['train_photos']} | {each['photos']} | {each['translation_to_nearest']:.2f} | "
-            f"{each['rotation_to_nearest_deg']:.0f}° | {each['visible']:.2f} |"
+            f"| {name} | {', '.join(map(str, seeds[name]))} | {each['train_photos']} | {each['photos']} | "
+            f"{each['translation_to_nearest']:.2f} | {each['rotation_to_nearest_deg']:.0f}° | {each['visible']:.2f} |"
         )
+    if len(lines) == 2:
+        return []
     return ["## The scenes", "", *lines, "", "Means over the scored photos; all cameras in [-1, 1] (the paper's 0.62, "
             "28.5°; MipNeRF-360 0.07, 10.5°)."]  # fmt: skip
 
 
-def convention_lines(cells: list[Row]) -> list[str]:
+def convention_lines(main: list[Row]) -> list[str]:
     """How far the published conventions differ on the very same renders: those of the field alone."""
-    known = [cell["conventions"] for cell in cells if cell["table"] == "main" and cell.get("conventions")]
-    names = [name for name in (known[0] if known else {}) if all(name in each for each in known)]
+    known = [(cell["scene"], cell["conventions"]) for cell in main if cell.get("conventions")]
+    names = [name for name in (known[0][1] if known else {}) if all(name in each for _, each in known)]
     if not names:
         return []
 
     def mean(name: str, key: str) -> float | None:
-        values = [each[name].get(key) for each in known]
-        return float(np.mean(values)) if all(value is not None for value in values) else None  # type: ignore[arg-type]
+        scenes: dict[str, list[float | None]] = {}
+        for scene, each in known:
+            scenes.setdefault(scene, []).append(each[name].get(key))
+        if any(value is None for values in scenes.values() for value in values):
+            return None
+        return float(np.mean([np.mean(values) for values in scenes.values()]))  # type: ignore[arg-type]
 
     scores: dict[str, Row] = {
         name: {"convention": name, **{key: mean(name, key) for key in get_convention(name).keys}} for name in names
@@ -202,7 +241,7 @@ def convention_lines(cells: list[Row]) -> list[str]:
     rows = [{**row, "method": row["metric"]} for row in convention_rows(scores)
             if any(row[name] is not None for name in names)]  # fmt: skip
     return ["## The same renders under every published convention", "",
-            f"`field`, mean of {len(known)} scenes; these columns must never be mixed:", "",
+            f"`field`, mean of {len({scene for scene, _ in known})} scenes; these columns must never be mixed:", "",
             format_rows(rows, (*names, "spread")).replace("| method |", "| metric |"), ""]  # fmt: skip
 
 

@@ -3,7 +3,7 @@
 A method gives up pixels in one of three orders: ``own``, by the method's own uncertainty; ``spread``, by how far the
 depth along the ray spreads, which any field can tell; ``photos``, by :func:`unghost.regularizer.photo_doubt`, which
 any field with the photos it was trained on can tell. A method without an uncertainty of its own has ``spread`` as own;
-ours have photo doubt times the root of the spread per depth.
+ours have photo doubt times the root of how far the disparity spreads, the spread of the log depth per depth.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from unghost.regularizer.photo_doubt import photo_doubt
 CONVENTION = "proper"
 COVERAGES = (0.02, 0.05, *(round(0.05 * step, 2) for step in range(2, 20)))
 CURVE_KEYS = ("psnr", "ssim", "disparity_mae", "normal_mean_deg")
-LEAST_SPREAD = 1e-3  # of a depth: a ray that is all of one mind is no proof
+LEAST_SPREAD = 1e-3  # of a disparity, cameras within +-1: a ray that is all of one mind is no proof
 SLACK = 2.0  # cells of the field behind its depth that a photo still sees
 DIGITS = 4  # of a curve's numbers
 

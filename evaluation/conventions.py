@@ -69,7 +69,7 @@ _RELEASED: dict[str, Any] = {
 _ALL = (
     Convention(
         "proper",
-        "this project: nothing that is masked out is looked at, and no score improves by removing things",
+        "this project: nothing that is masked out is looked at; what is removed lowers the coverage beside it",
         (*IMAGE_KEYS, "flip", *GEOMETRY_KEYS, "coverage", *AGREEMENT_KEYS),
         visible=True, depth_limit="scene", ssim="inside_mask", clipped_depth=True,
     ),

@@ -13,11 +13,11 @@ KIND = "uncertainty"
 def doubt(
     renders: Positional[Path], gt: Path, train_renders: Path, eval_split: str | None = None,
     train_split: str | None = None, downscale: float = 1.0, depth_along: Literal["ray", "axis"] = "ray",
-    normalize: bool = True, tolerance: float = 0.05, replace: bool = False,
+    normalize: bool = True, tolerance: float = 0.05, slack: float = 0.0, replace: bool = False,
 ) -> None:  # fmt: skip
     """Say which pixels not to trust, by the photos that were trained on; needs renders with depth, but no field.
 
-    Writes RENDERS/uncertainty, a .npy a view (0: the photos bear the colour out, 1: no photo sees the point) and a
+    Writes RENDERS/uncertainty, a .npy a view (0: the photos that see the point have its colour; 1: none sees it) and a
     picture for people. `unghost evaluate` then scores the method as a curve over coverage.
 
     Args:
@@ -29,7 +29,9 @@ def doubt(
         downscale: photo pixels per pixel of the renders, along each axis.
         depth_along: what the depths are measured along: the pixel's ray, or the camera's optical axis.
         normalize: the depths are in units in which the farthest camera coordinate is 1, not the file's.
-        tolerance: relative: how far behind a photo's depth a point is still seen by it.
+        tolerance: how far behind a photo's depth a point is still seen by it, and how far from it on either side still
+            the same surface, as a share of it.
+        slack: the same in the units of the depths, on top: two cells of the field's grid, if it has one.
         replace: uncertainty maps that are there already.
     """
     import numpy as np
@@ -54,15 +56,15 @@ def doubt(
         depth, photo_depth = ray_depth(depth, cameras), ray_depth(photo_depth, photo_cameras)
     found = photo_doubt(
         method.renders.colours, depth, cameras, photos=capture.images(taught), photo_depth=photo_depth,
-        photo_cameras=photo_cameras, tolerance=tolerance,
+        photo_cameras=photo_cameras, tolerance=tolerance, slack=slack,
     )  # fmt: skip
     short = [Path(name).name for name in names]
     for name, values in zip(short if len(set(short)) == len(short) else names, found):
         _write((renders / KIND / name).with_suffix(".npy"), values)
     seen = found[found < UNSEEN]
-    colours = f"; colours off by {np.median(seen):.3f} in the median where one does" if seen.size else ""
+    median = f"; a doubt of {np.median(seen):.3f} in the median where one does" if seen.size else ""
     print(f"{len(names)} views, {len(photo_names)} photos: {seen.size / found.size:.3f} of the pixels show what one of "
-          f"them sees{colours}\n{renders / KIND}")  # fmt: skip
+          f"them sees{median}\n{renders / KIND}")  # fmt: skip
 
 
 def _there(depth: Any, folder: Path) -> Any:

@@ -78,6 +78,18 @@ def test_a_ghost_is_doubted_and_the_wall_is_not(folder, capsys):
     assert half["psnr"] > row["psnr"] + 10  # the ghost goes first
 
 
+def test_slack_lets_photos_see_further(folder, capsys):
+    for name in TAUGHT:  # photos whose depth stops a fifth before the wall see nothing of it
+        np.save(folder / "train" / "depth" / f"{name}.npy", np.full((HEIGHT, WIDTH), 0.8 * WALL))
+    assert run(folder) == 0
+    assert "a doubt of" in capsys.readouterr().out  # of the ghost, which stands before
+    assert np.load(folder / "renders" / "uncertainty" / "e1.npy").min() == 1.0
+    assert run(folder, "--replace", "--slack", str(0.3 * WALL)) == 0
+    assert np.median(np.load(folder / "renders" / "uncertainty" / "e1.npy")[:, 8:-8]) < 0.03
+    assert run(folder, "--replace", "--slack", "-1") == 2
+    assert "slack must be finite and >= 0, got -1" in capsys.readouterr().err
+
+
 def test_nothing_is_written_over(folder, capsys):
     assert run(folder) == 0
     assert run(folder) == 2
