@@ -184,12 +184,14 @@ def page(results: dict[str, Any], folder: Path) -> str:
 
 def knob_lines(main: list[Row]) -> list[str]:
     """Methods with a knob at all its settings, on the seed on which they were tried."""
-    rows = [row for row in summary_rows([cell for cell in main if cell["seed"] == 0]) if row["coverage"] is not None]
+    turned_on = {cell["scene"] for cell in main if "@" in cell["method"]}
+    first = [cell for cell in main if cell["seed"] == 0 and cell["scene"] in turned_on]
+    rows = [row for row in summary_rows(first) if row["coverage"] is not None]
     turned = {row["method"].split(" @ ")[0] for row in rows if "@" in row["method"]}
     shown = [row for row in rows if row["method"].split(" @ ")[0] in turned]
     keys = ("psnr", "disparity_mae", "coverage", "floater_recall", "surface_kept", "psnr_at_coverage",
             "psnr_at_coverage_at_best")  # fmt: skip
-    said = ("Seed 0. The row without a number stands in the tables. `…_at_best`: with the knob and the order that turn "
+    said = ("Seed 0 of the synthetic scenes. The row without a number stands in the tables. `…_at_best`: with the knob and the order that turn "
             "out best on each scene, which takes an eye on the truth: nobody can have that.")  # fmt: skip
     return ["## Knobs", "", said, "", format_rows(shown, keys), ""] if shown else []
 

@@ -10,7 +10,7 @@ orders of pixels (``trajectory_scores.py``). Every finished row is saved at once
 ``docs/results/two_trajectory.json``; what is there is not done again, so that a run that was broken off goes on with
 the same command, and several processes may share the file, each with other scenes or seeds (with ``--threads 1``:
 means of seconds are over rows with the most threads). Knobs and the field of both sweeps are looked at on seed 0
-alone.
+of the synthetic scenes alone.
 ``--equal-seconds`` trains for as long as ``visibility`` took (the median of the main table), ``--ablation`` does the
 paper's ablation, ``--every-eighth`` scores every 8th photo of the first sweep. The page: ``trajectory_page.py``.
 """
@@ -268,7 +268,8 @@ def run_stage(options: Options, stage: Stage, cache: FitCache, ledger: Ledger, p
                 outcomes = [Outcome(better, seconds, seconds * options.threads)]
             else:
                 outcomes = table[name](job)
-            outcomes = outcomes[:1] if seed > 0 else outcomes  # other settings of a knob are looked at once
+            if seed > 0 or scene.photographed is None:
+                outcomes = outcomes[:1]
             last, *_ = ledger.add(rows_of(keys[name], stage, outcomes, space))
             say("    " + " ".join(f"{key} {last[key]:.3f}" for key in ("psnr", "disparity_mae", "coverage", "seconds")
                                   if last.get(key) is not None))  # fmt: skip
