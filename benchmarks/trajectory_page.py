@@ -191,8 +191,9 @@ def knob_lines(main: list[Row]) -> list[str]:
     shown = [row for row in rows if row["method"].split(" @ ")[0] in turned]
     keys = ("psnr", "disparity_mae", "coverage", "floater_recall", "surface_kept", "psnr_at_coverage",
             "psnr_at_coverage_at_best")  # fmt: skip
-    said = ("Seed 0 of the synthetic scenes. The row without a number stands in the tables. `…_at_best`: with the knob and the order that turn "
-            "out best on each scene, which takes an eye on the truth: nobody can have that.")  # fmt: skip
+    said = ("Seed 0 of the synthetic scenes. The row without a number stands in the tables. `…_at_best`: with the knob "
+            "and the order that turn out best on each scene, which takes an eye on the truth: nobody can have "
+            "that.")  # fmt: skip
     return ["## Knobs", "", said, "", format_rows(shown, keys), ""] if shown else []
 
 
