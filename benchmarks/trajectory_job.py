@@ -37,7 +37,7 @@ class Weights:
     regnerf: float = 1e-2
     distortion: float = 1e-1
     free_space: float = 1e-5
-    bayes_rays: float = 0.8  # the threshold above which what is uncertain goes
+    bayes_rays: float = 0.7  # the threshold above which what is uncertain goes
     dsds_paper: float = 0.1  # of the paper's own loss
 
 

@@ -1,9 +1,11 @@
 """How much should each rival's loss weigh? Every factor on development scenes, none of which the benchmark scores.
 
     python benchmarks/trajectory_sweep.py
+    python benchmarks/trajectory_sweep.py --losses       tries nothing: chooses anew among what is there
 
 All factors of a loss are cut to the lowest coverage among them; of those whose PSNR is there within .1 dB of the best,
-the one with the smallest disparity error is ``chosen``, mean over the scenes. Writes
+the one with the smallest disparity error is ``chosen``, mean over the scenes; what differs by less than .001 and .01 dB
+is a tie, and stays with the factor that is there. Writes
 docs/results/two_trajectory_sweep.json, off which ``Weights`` in ``trajectory_job.py`` is read; losses that are not
 asked for stay there as they were.
 """
@@ -71,7 +73,10 @@ def chosen_factors(rows: list[dict[str, Any]]) -> dict[str, str]:
         mine = [row for row in rows if row["table"] == loss]
         most = max(row["psnr_at_coverage"] for row in mine)
         good = [row for row in mine if row["psnr_at_coverage"] >= most - WITHIN_DB]
-        result[loss] = min(good, key=lambda row: row["disparity_mae_at_coverage"])["method"]
+        there = f"{loss} {getattr(Weights(), loss):g}"
+        result[loss] = min(good, key=lambda row: (round(row["disparity_mae_at_coverage"], 3),
+                                                  -round(row["psnr_at_coverage"], 2), row["method"] != there)
+                           )["method"]  # fmt: skip
     return result
 
 
@@ -93,19 +98,19 @@ def main() -> None:
                 cells.append({"table": loss, "scene": name, "seed": 0, "method": f"{factor:g}", **row})
                 say(f"{name} {loss} {factor:g}: psnr {row['psnr']:.2f} coverage {row['coverage']:.3f} "
                     f"disparity {row['disparity_mae']:.3f}")  # fmt: skip
-    rows = summary_rows(cells)
+    path = options.out / "two_trajectory_sweep.json"
+    stored = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"rows": []}
+    rows = [{**row, "method": f"{row['table']} {row['method']}"} for row in summary_rows(cells)]
+    rows = [row for row in stored["rows"] if row["table"] not in options.losses] + rows
     best = chosen_factors(rows)
     for row in rows:
         row["chosen"] = best[row["table"]] == row["method"]
-        row["method"] = f"{row['table']} {row['method']}"
         say(f"{row['method']}: {row['psnr_at_coverage']:.3f} dB at {row['at_coverage']:.3f}, disparity "
             f"{row['disparity_mae_at_coverage']:.4f}{' *' * row['chosen']}")  # fmt: skip
-    path = options.out / "two_trajectory_sweep.json"
-    stored = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"rows": []}
-    rows = [row for row in stored["rows"] if row["table"] not in options.losses] + rows
     command = f"python benchmarks/trajectory_sweep.py --scenes {' '.join(options.scenes)}"
+    named = " ".join(options.losses)
     if options.losses != tuple(FACTORS):
-        command = f"{stored.get('command', '')} ; {command} --losses {' '.join(options.losses)}"
+        command = " ; ".join([stored.get("command", ""), *([f"{command} --losses {named}"] if named else [])])
     results = build_results(rows, command=command, seeds=[0], scene_seed=options.scene_seed, threads=options.threads)
     write_results(path, json_ready(results))
 
