@@ -39,6 +39,8 @@ def write_figures(path: Path) -> None:
             axes.set_ylabel(label)
             if key == "disparity_mae":
                 axes.set_yscale("log")
+                for ticks in ("major", "minor"):
+                    getattr(axes.yaxis, f"set_{ticks}_formatter")("{x:g}")
     for axes in grid[-1]:
         axes.set_xlabel("coverage: share of all pixels that are scored")
     grid[0][0].legend(fontsize=9, frameon=False)
