@@ -210,8 +210,9 @@ def test_every_method_runs_and_a_run_goes_on_where_it_was_broken_off(bench, stag
     bench["trajectory_page"].main()
     assert (tmp_path / "two_trajectory.png").stat().st_size > 10_000
     text = (tmp_path / "README.md").read_text()
-    assert "Masked PSNR at equal coverage" in text
-    assert "| room-1 | 4 | 2 |" in text  # the scene and its photos
+    assert "## At equal coverage" in text
+    assert "masked PSNR, mean over equal coverages" in text
+    assert "| room-1 | 0 | 4 | 2 |" in text  # the scene, its seeds and its photos
     assert all(f"| {method} |" in text for method in options.methods)
 
     again = main.Ledger(options)
