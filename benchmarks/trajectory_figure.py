@@ -12,7 +12,7 @@ from trajectory_tables import COLORS, REFERENCE, Cell, finished, main_rows, scor
 
 DRAWN = (
     "field", "visibility", "visibility+tv", "visibility+distortion", "bayes-rays", "clean", "photo-doubt",
-    "dsds-restoration", "dsds-restoration+tv", "dsds-restoration+distortion",
+    "dsds-restoration", "dsds-restoration+tv", "dsds-restoration+distortion", "dsds-once+tv",
 )  # fmt: skip
 OTHERS = "#d0d0d0"
 ROWS = {"own": "each cut in its own order of pixels", "photos": "all cut by photo doubt"}

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 from trajectory_job import Clock, Job, Outcome, Term, fine_tuned, make_regularizer, visibility
 from trajectory_rivals import free_space, regnerf, sparsity, total_variation
 
@@ -22,6 +23,7 @@ from unghost.fields.uncertainty import LOWEST, deformation_uncertainty
 from unghost.regularizer.clean import Judgement, judge
 from unghost.regularizer.components import label_components
 from unghost.regularizer.keep_mask import KeepMask, lattice_axes
+from unghost.regularizer.removal import RemovalLoss
 from unghost.regularizer.settings import RegularizerSettings
 
 PAPER_PRIOR = Path(__file__).parent / "weights" / "small-epsilon.onnx"
@@ -49,6 +51,22 @@ def _dsds_and_distortion(job: Job) -> list[Outcome]:
 
 def _dsds_and_tv(job: Job) -> list[Outcome]:
     return [_doubted(fine_tuned(job, make_regularizer, total_variation(job)))]
+
+
+def _once_and_tv(job: Job) -> list[Outcome]:
+    return [_doubted(fine_tuned(job, visibility, judged_once(job), total_variation(job)))]
+
+
+def judged_once(job: Job) -> Term:
+    """What ``clean`` would take out of the field at the first step is held down at every step."""
+    removal: list[RemovalLoss] = []
+
+    def term(field: Any, step: int) -> Tensor:
+        if not removal:
+            removal.append(RemovalLoss(judged(job, field).mask(), seed=job.seed))
+        return removal[0](field.density_fn)
+
+    return term
 
 
 def restoration(job: Job, **over: Any) -> list[Outcome]:
@@ -173,6 +191,8 @@ METHODS: dict[str, Callable[[Job], list[Outcome]]] = {
     "dsds-restoration": lambda job: [once(job, "dsds-restoration")],
     "dsds-restoration+distortion": _dsds_and_distortion,
     "dsds-restoration+tv": _dsds_and_tv,
+    "dsds-once": lambda job: [_doubted(fine_tuned(job, visibility, judged_once(job)))],
+    "dsds-once+tv": _once_and_tv,
     "clean": lambda job: cleaned(job, job.base),
     "visibility+clean": _clean_after("visibility"),
     "dsds-restoration+clean": _clean_after("dsds-restoration"),
@@ -181,5 +201,6 @@ FACTOR_OF = {
     **{f"visibility+{name}": name for name in ("sparsity", "tv", "regnerf", "distortion")},
     "free-space": "free_space", "bayes-rays": "bayes_rays", "visibility+bayes-rays": "bayes_rays",
     "dsds-paper": "dsds_paper", "dsds-restoration+distortion": "distortion", "dsds-restoration+tv": "tv",
+    "dsds-once+tv": "tv",
 }  # fmt: skip
 UNTRAINED = ("fitted", "photo-doubt", "bayes-rays", "components", "clean")  # equal seconds say nothing of them

@@ -21,8 +21,8 @@ from unghost.evaluation.report import convention_rows
 
 ROOT = Path(__file__).resolve().parents[1]
 OURS = (
-    "photo-doubt", "dsds-restoration", "dsds-restoration+distortion", "dsds-restoration+tv", "clean",
-    "visibility+clean", "dsds-restoration+clean",
+    "photo-doubt", "dsds-restoration", "dsds-restoration+distortion", "dsds-restoration+tv", "dsds-once",
+    "dsds-once+tv", "clean", "visibility+clean", "dsds-restoration+clean",
 )  # fmt: skip
 NOTHING_OF_OURS = "photo-doubt"  # but the order of pixels: where all have the same, it is the field as it was fitted
 WATCHED = ("dsds-restoration", "clean")
@@ -40,6 +40,8 @@ ROWS = {
     "dsds-paper": "the paper's method, with the paper's thresholds and a diffusion trained here",
     "photo-doubt": "ours: `fitted`, nothing but the order of pixels changed",
     "dsds-restoration": "ours: score distillation with the shipped restoration prior",
+    "dsds-once": "ours: the prior judges the field once, as for `clean`, and what it would take out is held down while "
+    "the field trains on (`RemovalLoss`): the photos may object",
     "clean": "ours: `unghost.clean` on `fitted`, or after another method (`…+clean`)",
 }
 PLAIN = {

@@ -36,6 +36,7 @@ COLORS = {  # in the order of the tables
     "visibility+distortion": "#9467bd", "free-space": "#e7ba52", "bayes-rays": "#2ca02c",
     "visibility+bayes-rays": "#98df8a", "components": "#8c564b", "dsds-paper": "#f7b6d2", "photo-doubt": "#bc80bd",
     "dsds-restoration": "#d62728", "dsds-restoration+distortion": "#8b0000", "dsds-restoration+tv": "#e377c2",
+    "dsds-once": "#b15928", "dsds-once+tv": "#6a3d9a",
     "clean": "#ff7f0e", "visibility+clean": "#ffbb78", "dsds-restoration+clean": "#ff9896",
 }  # fmt: skip
 Cell = dict[str, Any]

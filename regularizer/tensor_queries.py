@@ -14,13 +14,16 @@ from .losses import upcast
 
 DensityFn = Callable[[Any], Any]
 
+CALLER = "DensityRegularizer"
 WITHOUT_GRADIENT = (
-    "DensityRegularizer: density_fn returned densities without a gradient, so that the losses cannot change the field: "
+    "{caller}: density_fn returned densities without a gradient, so that the losses cannot change the field: "
     "is it detached, frozen, or under no_grad?"
 )
 
 
-def query_tensors(field: DensityFn, positions: Tensor, *, chunk: int, drop_invalid: bool) -> tuple[Tensor, Tensor]:
+def query_tensors(
+    field: DensityFn, positions: Tensor, *, chunk: int, drop_invalid: bool, caller: str = CALLER
+) -> tuple[Tensor, Tensor]:
     """Densities ``(M,)`` at ``positions (M, 3)``, at least float32, and which of them are valid.
 
     Args:
@@ -28,6 +31,7 @@ def query_tensors(field: DensityFn, positions: Tensor, *, chunk: int, drop_inval
         positions: float32.
         chunk: most positions a call.
         drop_invalid: put 0 for what is NaN, infinite or negative, and call it invalid, instead of raising.
+        caller: named in messages.
 
     Raises:
         TypeError: no tensor of floating-point numbers.
@@ -38,25 +42,25 @@ def query_tensors(field: DensityFn, positions: Tensor, *, chunk: int, drop_inval
     """
     if len(positions) == 0:
         return positions.new_zeros(0), torch.ones(0, dtype=torch.bool, device=positions.device)
-    values = torch.cat([_as_densities(field(part), part) for part in torch.split(positions, chunk)])
+    values = torch.cat([_as_densities(field(part), part, caller) for part in torch.split(positions, chunk)])
     if torch.is_grad_enabled() and not values.requires_grad:
-        warnings.warn(WITHOUT_GRADIENT, stacklevel=2)
+        warnings.warn(WITHOUT_GRADIENT.format(caller=caller), stacklevel=2)
     if not drop_invalid:
-        check_density(values.detach(), positions, caller="DensityRegularizer")
+        check_density(values.detach(), positions, caller=caller)
         return values, torch.ones_like(values, dtype=torch.bool)
     valid = torch.isfinite(values.detach()) & (values.detach() >= 0)
     return torch.where(valid, values, torch.zeros_like(values)), valid
 
 
-def _as_densities(density: Any, positions: Tensor) -> Tensor:
+def _as_densities(density: Any, positions: Tensor, caller: str) -> Tensor:
     """What a callable returned for ``positions (M, 3)``, as ``(M,)``, at least float32, or an error that names it."""
     if not isinstance(density, Tensor):
-        raise TypeError(f"DensityRegularizer: density_fn must return a torch tensor, got {type(density).__name__}")
+        raise TypeError(f"{caller}: density_fn must return a torch tensor, got {type(density).__name__}")
     if not density.is_floating_point():
-        raise TypeError(f"DensityRegularizer: density_fn must return floating-point densities, got {density.dtype}")
+        raise TypeError(f"{caller}: density_fn must return floating-point densities, got {density.dtype}")
     if density.device != positions.device:
         raise ValueError(
-            f"DensityRegularizer: density_fn must return densities on the device of its positions, "
+            f"{caller}: density_fn must return densities on the device of its positions, "
             f"{positions.device}, got {density.device}"
         )
-    return upcast(check_density_shape(density, positions, caller="DensityRegularizer"))
+    return upcast(check_density_shape(density, positions, caller=caller))
