@@ -32,7 +32,8 @@ class RemovalLoss:
 
     Args:
         mask: what is to go; nothing outside its removed cells is ever asked or moved.
-        weight: of the mean optical depth per removed cell, ``density * mask.pitch``; finite, >= 0.
+        weight: of the mean optical depth per removed cell, ``density * mask.pitch``; finite, >= 0. Ten times the
+            default takes more ghosts, and coverage with them.
         samples: random positions a step, >= 1; uniform in the removed cells.
         seed: positions of step s depend on (seed, s) alone.
         device: where positions are created; None for the device of the field's parameters, else the CPU.
@@ -54,7 +55,7 @@ class RemovalLoss:
         self,
         mask: KeepMask,
         *,
-        weight: float = 0.1,
+        weight: float = 0.01,
         samples: int = 1 << 15,
         seed: int = 0,
         device: torch.device | str | None = None,
