@@ -47,13 +47,13 @@ ROWS = {
 PLAIN = {
     "psnr_at_coverage": ("masked PSNR at equal coverage", " dB", 1, 2),
     "psnr_area": ("masked PSNR, mean over equal coverages", " dB", 1, 2),
-    "psnr_area_by_photos": ("masked PSNR, that mean, if all are cut by photo doubt", " dB", 1, 2),
-    "psnr_area_by_spread": ("masked PSNR, that mean, if all are cut by the spread of the depth", " dB", 1, 2),
+    "psnr_area_by_photos": ("masked PSNR, mean, all cut by photo doubt", " dB", 1, 2),
+    "psnr_area_by_spread": ("masked PSNR, mean, all cut by spread of depth", " dB", 1, 2),
     "ssim_at_coverage": ("masked SSIM at equal coverage", "", 1, 3),
     "ssim_area": ("masked SSIM, mean over equal coverages", "", 1, 3),
     "disparity_mae_at_coverage": ("disparity error at equal coverage", "", -1, 3),
     "disparity_mae_area": ("disparity error, mean over equal coverages", "", -1, 3),
-    "disparity_mae_area_by_photos": ("disparity error, that mean, if all are cut by photo doubt", "", -1, 3),
+    "disparity_mae_area_by_photos": ("disparity error, mean, all cut by photo doubt", "", -1, 3),
     "free_space_error": ("opacity left in free space", "", -1, 4),
 }
 OTHER_TABLES = {
@@ -67,7 +67,8 @@ Row = dict[str, Any]
 
 
 def who_wins(results: dict[str, Any]) -> list[str]:
-    """A line a score: who is best of ours and of the rivals, and whether the difference is more than chance."""
+    """In a sentence a verdict, then a line a score: the best of ours and of the rivals, and whether that is chance."""
+    said: dict[str, list[str]] = {}
     methods = [row for row in main_rows(results, "main") if row["method"] != REFERENCE]
     head = ("score", "", "our best", "best rival", "ours is better by (95 %)", *(f"`{name}`" for name in WATCHED))
     lines = [f"| {' | '.join(head)} |", "| --- |" + " --- |" * (len(head) - 1)]
@@ -79,6 +80,7 @@ def who_wins(results: dict[str, Any]) -> list[str]:
         if not ours or not rivals:
             continue
         apart = difference(results["cells"], ours[0]["method"], rivals[0]["method"], key, sign)
+        said.setdefault(verdict(apart), []).append(name)
         best = [f"`{row['method']}` {row[key]:.{digits}f}{unit}" for row in (ours[0], rivals[0])]
         by = f"{apart.mean:.{digits}f}" if apart.mean is not None else "–"
         if apart.low is not None:
@@ -86,7 +88,17 @@ def who_wins(results: dict[str, Any]) -> list[str]:
         places = {row["method"]: f"{row[key]:.{digits}f}, place {place}" for place, row in enumerate(known, 1)}
         watched = [places.get(method, "–") for method in WATCHED]
         lines.append(f"| {' | '.join([name, f'**{verdict(apart)}**', *best, by, *watched])} |")
-    return lines
+    short = [
+        f"- **{which[0].upper()}{which[1:]}**: {'; '.join(names)}."
+        for which, names in sorted(said.items(), key=_best_first)
+    ]
+    return [*short, "", *lines]
+
+
+def _best_first(said: tuple[str, list[str]]) -> tuple[bool, bool]:
+    """Won, perhaps won, perhaps lost, lost."""
+    lost = said[0].startswith("we lose")
+    return lost, ("," in said[0]) != lost
 
 
 def verdict(apart: Interval) -> str:

@@ -135,7 +135,8 @@ def test_the_verdict_counts_scenes_not_means(bench, ours, rival, said):
     for scene, first, second in zip("abcdef", ours, rival):
         cells += [cell("clean", scene, 0.5, [(0.5, first)]), cell("field", scene, 0.5, [(0.5, second)])]
     rows = bench["trajectory_tables"].summary_rows(cells)
-    _, _, line = page.who_wins({"rows": rows, "cells": cells})
+    short, _, _, _, line = page.who_wins({"rows": rows, "cells": cells})
+    assert short == f"- **{said[0].upper()}{said[1:]}**: masked PSNR at equal coverage."
     assert line.startswith(f"| masked PSNR at equal coverage | **{said}** | `clean` ")
     assert f"| `field` {np.mean(rival):.2f} dB |" in line
 
@@ -148,7 +149,7 @@ def test_an_order_that_all_have_is_nobodys_own(bench):
     rows = bench["trajectory_tables"].summary_rows(cells)
     lines = page.who_wins({"rows": rows, "cells": cells})
     own, photos = (next(line for line in lines if line.startswith(f"| masked PSNR, {name} |")) for name in
-                   ("mean over equal coverages", "that mean, if all are cut by photo doubt"))  # fmt: skip
+                   ("mean over equal coverages", "mean, all cut by photo doubt"))  # fmt: skip
     assert "| `photo-doubt` 25.00 dB | `fitted` 25.00 dB |" in own
     assert "| **we lose** | `clean` 22.00 dB | `fitted` 25.00 dB | -3.00 (-3.00 to -3.00) |" in photos
 
