@@ -54,7 +54,7 @@ def summary_rows(cells: Sequence[Cell]) -> list[dict[str, Any]]:
         mine = [cell for cell in cells if (cell["table"], cell["method"]) == (table, method)]
         row: dict[str, Any] = {
             "method": method, "table": table, "convention": mine[0]["convention"],
-            "scenes": sorted({cell["scene"] for cell in mine}), "runs": len(mine), "note": mine[0].get("note", ""),
+            "scenes": sorted({cell["scene"] for cell in mine}), "runs": len(mine), "note": mine[-1].get("note", ""),
         }  # fmt: skip
         intervals = {}
         most = max(cell.get("threads", 0) for cell in mine)
