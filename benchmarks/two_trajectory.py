@@ -1,7 +1,7 @@
 """The two-trajectory benchmark: who takes ghosts out, at equal coverage, on scenes of which everything is known?
 
     python benchmarks/two_trajectory.py --capture CAPTURE      the whole: a night on two cores
-    python benchmarks/two_trajectory.py --short                two scenes, one seed, few steps: ten minutes
+    python benchmarks/two_trajectory.py --short                two scenes, one seed, few steps: a quarter of an hour
     python benchmarks/two_trajectory.py --scenes room-0 --methods field visibility
 
 A field is fitted to one sweep of photos, every method improves it (``trajectory_methods.py``) for the same steps, and
