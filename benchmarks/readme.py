@@ -255,9 +255,12 @@ def two_trajectory(results: dict[str, Any]) -> list[str]:
     head = ("method", "PSNR, equal coverage", "mean over coverages", "all cut by photo doubt", "disparity error, mean",
             "PSNR, own coverage", "coverage", "opacity in free space", "CPU seconds")  # fmt: skip
     scenes = sorted({scene for row in rows for scene in row["scenes"]})
+    (convention,), most = {row["convention"] for row in rows}, max(row["runs"] for row in rows)
+    fewer = ", ".join(f"`{row['method']}` {row['runs']}" for row in rows if row["runs"] < most)
     return [
         f"**Two trajectories**: trained on one sweep of photos, scored on another; {len(scenes)} scenes "
-        f"({', '.join(scenes)}), {max(row['runs'] for row in rows)} runs a method, equal steps for all that train. The "
+        f"({', '.join(scenes)}), convention `{convention}`, {most} runs a method{f' ({fewer})' if fewer else ''}, "
+        "equal steps for all that train. `pseudo-gt` has seen what it is scored on, and its fit is not in the seconds. The "
         "first four columns cut every method to the lowest coverage among them, and to all from .1 up to it, in its "
         "own order of pixels or all by photo doubt:", "",
         *table(head, lines), "",

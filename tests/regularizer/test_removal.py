@@ -12,11 +12,11 @@ from unghost.regularizer.removal import RemovalLoss
 BOX = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
 
 
-def mask_without(*cells, side=4, box=BOX, pitch=None):
-    keep = np.ones((side,) * 3, dtype=bool)
+def mask_without(*cells):
+    keep = np.ones((4, 4, 4), dtype=bool)
     for cell in cells:
         keep[cell] = False
-    return KeepMask(box, pitch or 2 / side, keep)
+    return KeepMask(BOX, 0.5, keep)
 
 
 class Grid(torch.nn.Module):
