@@ -260,9 +260,9 @@ def two_trajectory(results: dict[str, Any]) -> list[str]:
     return [
         f"**Two trajectories**: trained on one sweep of photos, scored on another; {len(scenes)} scenes "
         f"({', '.join(scenes)}), convention `{convention}`, {most} runs a method{f' ({fewer})' if fewer else ''}, "
-        "equal steps for all that train. `pseudo-gt` has seen what it is scored on, and its fit is not in the seconds. The "
-        "first four columns cut every method to the lowest coverage among them, and to all from .1 up to it, in its "
-        "own order of pixels or all by photo doubt:", "",
+        "equal steps for all that train. `pseudo-gt` has seen what it is scored on, and its fit is not in the seconds. "
+        "The first four columns cut every method to the lowest coverage among them, and to all from .1 up to it, in "
+        "its own order of pixels or all by photo doubt:", "",
         *table(head, lines), "",
         "Who wins where, the knobs, the curves and the paper's ablation, us losing included: "
         "[docs/results](docs/results/README.md).", "",
