@@ -154,9 +154,15 @@ def fine_tune(
         )
         hooks = training_hooks(regularizer)
     record = train_field(
-        field, train.cameras, train.photos, steps=options.finetune_steps, seed=seed, fine_tune=True, progress=True,
+        field,
+        train.cameras,
+        train.photos,
+        steps=options.finetune_steps,
+        seed=seed,
+        fine_tune=True,
+        progress=True,
         **hooks,
-    )  # fmt: skip
+    )
     return {**render(field, evaluation.cameras), "seconds": np.array(record["seconds"])}
 
 
@@ -226,13 +232,27 @@ def run(options: Options) -> dict[str, Any]:
         per_seed.append(score_seed(seed, tuned, evaluation, pseudo_views["depth"], visible, limit))
     rows = [mean_over_seeds(method, [scores[method] for scores in per_seed]) for method in methods]
     results = build_results(
-        rows, command=options.command(), seeds=options.seeds, capture=capture.folder.resolve().name, priors=weights,
+        rows,
+        command=options.command(),
+        seeds=options.seeds,
+        capture=capture.folder.resolve().name,
+        priors=weights,
         regularizer={k: v for k, v in dataclasses.asdict(RegularizerSettings(**overrides)).items() if k != "seed"},
-        depth_limit=limit, visible_share=float(visible.mean()), fields=records, pseudo_ground_truth=pseudo_record,
-    )  # fmt: skip
+        depth_limit=limit,
+        visible_share=float(visible.mean()),
+        fields=records,
+        pseudo_ground_truth=pseudo_record,
+    )
     write_results(options.out / "capture.json", protocol.json_ready(results))
-    draw(options, {"photo · pseudo depth": {"rgb": evaluation.photos, "depth": pseudo_views["depth"]},
-                   **{methods[method]: views for method, views in shown.items()}}, limit, rows)  # fmt: skip
+    draw(
+        options,
+        {
+            "photo · pseudo depth": {"rgb": evaluation.photos, "depth": pseudo_views["depth"]},
+            **{methods[method]: views for method, views in shown.items()},
+        },
+        limit,
+        rows,
+    )
     return results
 
 
@@ -241,11 +261,14 @@ def draw(options: Options, columns: dict[str, Views], limit: float, rows: list[d
     views = np.unique(np.linspace(0, count - 1, FIGURE_VIEWS + 2).round().astype(int)[1:-1]).tolist()
     numbers = " · ".join(f"{row['method']} {row['psnr'] or 0:.2f} dB at {row['coverage']:.3f}" for row in rows)
     draw_comparison(
-        options.out / "capture.png", columns, views=views, limit=limit,
+        options.out / "capture.png",
+        columns,
+        views=views,
+        limit=limit,
         title=f"{options.capture.resolve().name}: trained on {options.train}, seen from {options.eval}",
         note=f"Below each picture its depth (warm is near; grey: nothing within the depth limit). Pictures: seed "
         f"{options.seeds[0]}. Masked PSNR at coverage, mean over seeds {list(options.seeds)}: {numbers}.",
-    )  # fmt: skip
+    )
 
 
 def main() -> None:

@@ -132,8 +132,14 @@ def capture_shards(
         arrays = harvest_cubes(np.random.default_rng([seed, 0xCA9]), fitted, truth, HarvestConfig(cubes=cubes))
         arrays["group"] = np.full(cubes, seed, dtype=np.int32)
         provenance = {
-            "recipe": "capture", "capture": capture.resolve().name, "train": train, "better": list(better),
-            "seed": seed, "field": "dense", "sha256": record["sha256"], "licence": "see the capture",
-        }  # fmt: skip
+            "recipe": "capture",
+            "capture": capture.resolve().name,
+            "train": train,
+            "better": list(better),
+            "seed": seed,
+            "field": "dense",
+            "sha256": record["sha256"],
+            "licence": "see the capture",
+        }
         write_shard(target, arrays, provenance)
     return shards

@@ -87,8 +87,11 @@ class Options:
     def command(self) -> str:
         """Without anybody's paths."""
         shards = " ".join(Path(spec).name for spec in self.shards)
-        sets = "".join(f" --{name} {getattr(self, name).resolve().name}" for name in ("harvest", "unseen", "capture")
-                       if getattr(self, name))  # fmt: skip
+        sets = "".join(
+            f" --{name} {getattr(self, name).resolve().name}"
+            for name in ("harvest", "unseen", "capture")
+            if getattr(self, name)
+        )
         return (
             f"python benchmarks/channels_study.py {shards} --meshes {self.meshes.name}{sets} --steps {self.steps} "
             f"--batch-size {self.batch_size} --size {self.size} --cubes {self.cubes}"
@@ -129,9 +132,14 @@ def trained(variant: str, options: Options, shards: Sequence[tuple[str, float]])
     if not model.exists():
         network = dataclasses.replace(SIZES[options.size], channels=VARIANTS[variant])
         config = TrainConfig(
-            name=f"study {variant}", network=network, steps=options.steps, batch_size=options.batch_size,
-            seed=options.seed, threads=options.threads, validate_seconds=0.0,
-        )  # fmt: skip
+            name=f"study {variant}",
+            network=network,
+            steps=options.steps,
+            batch_size=options.batch_size,
+            seed=options.seed,
+            threads=options.threads,
+            validate_seconds=0.0,
+        )
         used = bit_shards(shards, options.runs / "bits") if variant == BIT else shards
         train(config, train_shards=used, out=folder, resume=True)
     return model
@@ -157,9 +165,13 @@ def rows_of(variant: str, model: Path, sets: Sequence[CubeSet]) -> list[dict[str
 def wanted_sets(options: Options) -> list[CubeSet]:
     """The sets of the reference measurement, single families of corruption aside."""
     measurement = Measurement(
-        meshes=options.meshes, harvest=options.harvest, unseen=options.unseen, capture=options.capture,
-        cubes=options.cubes, cache=options.cache,
-    )  # fmt: skip
+        meshes=options.meshes,
+        harvest=options.harvest,
+        unseen=options.unseen,
+        capture=options.capture,
+        cubes=options.cubes,
+        cache=options.cache,
+    )
     return [cubes for cubes in all_sets(measurement) if cubes.about.get("family", MIXED) == MIXED]
 
 
@@ -171,13 +183,23 @@ def main() -> None:
     sets, rows = wanted_sets(options), list[dict[str, Any]]()
     for variant, model in models.items():
         rows += rows_of(variant, model, sets)
-        fog = [f"{row['set']} {row['ghosts_removed_98']:.3f}" for row in rows
-               if row["method"] == variant and row["set"] in FOG]  # fmt: skip
+        fog = [
+            f"{row['set']} {row['ghosts_removed_98']:.3f}"
+            for row in rows
+            if row["method"] == variant and row["set"] in FOG
+        ]
         say(f"{variant:46s} {'  '.join(fog)}")
-        write_results(options.out / "channels.json", build_results(
-            rows, command=options.command(), seeds=[options.seed], size=options.size, steps=options.steps,
-            batch_size=options.batch_size,
-        ))  # fmt: skip
+        write_results(
+            options.out / "channels.json",
+            build_results(
+                rows,
+                command=options.command(),
+                seeds=[options.seed],
+                size=options.size,
+                steps=options.steps,
+                batch_size=options.batch_size,
+            ),
+        )
 
 
 if __name__ == "__main__":

@@ -66,9 +66,7 @@ def setting_row(method: str, name: str, rooms: list[Room], threads: int, **setti
     denoiser, found, seconds = load_denoiser(name, threads=threads), [], []
     for room in rooms:
         begun = time.perf_counter()
-        mask = clean(
-            grid_density_fn(room.density, AABB), AABB, denoiser=denoiser, field_pitch=room.pitch, **settings
-        )  # fmt: skip
+        mask = clean(grid_density_fn(room.density, AABB), AABB, denoiser=denoiser, field_pitch=room.pitch, **settings)
         seconds.append(time.perf_counter() - begun)
         found.append(
             score(room, np.asarray(mask.keep(cell_centers(AABB, SHAPE)))) | {"windows": mask.details["windows"]}
@@ -86,8 +84,12 @@ def empty_rows(room: Room, options: Options) -> list[dict[str, Any]]:
     box = np.array(AABB)
     longer = np.stack([box[0], [2 * box[1, 0] - box[0, 0], *box[1, 1:]]])
     every: dict[str, Any] = {"skip_empty": False, "probe": 1}
-    ways = {"the room": (box, {}), "the room, nothing skipped": (box, every), "a box twice as long": (longer, {}),
-            "a box twice as long, nothing skipped": (longer, every)}  # fmt: skip
+    ways = {
+        "the room": (box, {}),
+        "the room, nothing skipped": (box, every),
+        "a box twice as long": (longer, {}),
+        "a box twice as long, nothing skipped": (longer, every),
+    }
     rows: list[dict[str, Any]] = []
     places, kept = cell_centers(AABB, SHAPE), dict[str, Any]()
     for method, (aabb, settings) in ways.items():

@@ -137,9 +137,15 @@ def measure(contender: Contender, options: Options) -> dict[str, Any]:
     assert iou >= contender.least_iou, f"{contender.name}: IoU {iou}"
     spent, peak = sum(cpu for _, cpu, _ in made), max(memory for _, _, memory in made)
     return {
-        "method": contender.name, "workers": options.workers, "cubes": count, "faces": contender.faces,
-        "cubes_per_second": count / wall, "milliseconds": spent / count * 1e3, "peak_megabytes": peak, "iou": iou,
-    }  # fmt: skip
+        "method": contender.name,
+        "workers": options.workers,
+        "cubes": count,
+        "faces": contender.faces,
+        "cubes_per_second": count / wall,
+        "milliseconds": spent / count * 1e3,
+        "peak_megabytes": peak,
+        "iou": iou,
+    }
 
 
 def sweep(mesh: Mesh, recipe: Recipe, cubes: int) -> float:
@@ -161,10 +167,16 @@ def sweeps(options: Options, cubes: int) -> list[dict[str, Any]]:
         mesh = Mesh.from_triangles(soup)
         seconds = time.process_time() - before
         held = [mesh.triangles, mesh.normals, mesh.cumulative_areas, mesh.tree.rows, *mesh.tree.levels]
-        rows.append({
-            "method": "mesh/unghost", "sweep": "faces", "faces": len(mesh.triangles), "seconds": seconds,
-            "megabytes": sum(array.nbytes for array in held) / 1e6, "milliseconds": sweep(mesh, RECIPE, cubes),
-        })  # fmt: skip
+        rows.append(
+            {
+                "method": "mesh/unghost",
+                "sweep": "faces",
+                "faces": len(mesh.triangles),
+                "seconds": seconds,
+                "megabytes": sum(array.nbytes for array in held) / 1e6,
+                "milliseconds": sweep(mesh, RECIPE, cubes),
+            }
+        )
     for edge in SWEEP_EDGES:
         found = sweep(ball(), dataclasses.replace(RECIPE, edge_fraction=(edge, edge)), cubes)
         rows.append({"method": "mesh/unghost", "sweep": "edge_fraction", "edge_fraction": edge, "milliseconds": found})

@@ -170,8 +170,10 @@ def measure(options: Options) -> dict[str, Any]:
     say(f"{sum(map(len, sets))} cubes in {len(sets)} sets, {len(methods)} methods")
     results: dict[str, Any] = {}
     files = dict(options.named())
-    priors = {name: file_hash(file) if "." in file else load_denoiser(file).manifest.body_sha256
-              for name, file in files.items()}  # fmt: skip
+    priors = {
+        name: file_hash(file) if "." in file else load_denoiser(file).manifest.body_sha256
+        for name, file in files.items()
+    }
     for name, denoiser in methods:
         about = {"model": name} if name in files else {}
         for variant, used, timestep in variants_of(name, denoiser, options.timesteps):
@@ -184,8 +186,11 @@ def measure(options: Options) -> dict[str, Any]:
             rows += [*mine, mean_over_severities(mine, variant) | about]
             say(_headline(rows, variant))
         if len(denoiser.manifest.channels) > 1:
-            rows += [row_of(f"{name}, blind", denoiser, blind(cubes), denoiser.manifest.default_timestep) | about
-                     for cubes in sets if tells_more(cubes)]  # fmt: skip
+            rows += [
+                row_of(f"{name}, blind", denoiser, blind(cubes), denoiser.manifest.default_timestep) | about
+                for cubes in sets
+                if tells_more(cubes)
+            ]
         if name in files:
             rows.append(speed_row(Model.of(name, files[name], WEIGHTS), options.threads) | about)
         results = build_results(

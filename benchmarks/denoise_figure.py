@@ -47,8 +47,11 @@ def draw(path: Path, rows: Sequence[dict[str, Any]]) -> None:
     figure, axes = plt.subplots(1, len(PANELS), figsize=(17, 5.2), constrained_layout=True)
     for axis, (name, key, heading) in zip(axes, PANELS):
         found = {method: _value(rows, method, name, key) for method in names}
-        timed = [(method, speeds[models[method]], value) for method, value in found.items()
-                 if value is not None and models[method] in speeds]  # fmt: skip
+        timed = [
+            (method, speeds[models[method]], value)
+            for method, value in found.items()
+            if value is not None and models[method] in speeds
+        ]
         best: dict[Any, tuple[float, str]] = {}  # of the ways to use a model
         for method, _, value in timed:
             best[models[method]] = max(best.get(models[method], (value, method)), (value, method))
@@ -66,8 +69,14 @@ def draw(path: Path, rows: Sequence[dict[str, Any]]) -> None:
         for method in [*sorted(filters, key=lambda m: -(filters[m] or 0.0))[:1], "input"]:
             if method in filters:
                 axis.axhline(filters[method], color="#999999", linewidth=0.8, linestyle="--")
-                axis.annotate(f"{method} (no training)", (0.01, filters[method]), fontsize=7, color="#666666",
-                              xycoords=("axes fraction", "data"), va="bottom")  # fmt: skip
+                axis.annotate(
+                    f"{method} (no training)",
+                    (0.01, filters[method]),
+                    fontsize=7,
+                    color="#666666",
+                    xycoords=("axes fraction", "data"),
+                    va="bottom",
+                )
         axis.set_title(heading, fontsize=10)
         axis.set_xlabel("cubes a second, two threads")
         if timed:

@@ -63,10 +63,14 @@ class Tally:
         """JSON-able; None for what is undefined."""
         ghosts, removed, true, kept, holes, filled = (int(count) for count in self.counts)
         scores: dict[str, Any] = {
-            "cubes": len(self.ious), "iou_before": float(np.mean(self.ious_before)), "iou": float(np.mean(self.ious)),
-            "iou_p5": float(np.quantile(self.ious, 0.05)), "floater_recall": _share(removed, ghosts),
-            "surface_kept": _share(kept, true), "holes_filled": _share(filled, holes),
-        }  # fmt: skip
+            "cubes": len(self.ious),
+            "iou_before": float(np.mean(self.ious_before)),
+            "iou": float(np.mean(self.ious)),
+            "iou_p5": float(np.quantile(self.ious, 0.05)),
+            "floater_recall": _share(removed, ghosts),
+            "surface_kept": _share(kept, true),
+            "holes_filled": _share(filled, holes),
+        }
         pooled = self._pooled()
         whole = [curve for curve in self.curves.values() if curve.true.any() and curve.ghost.any()]
         for share in KEPT:

@@ -114,10 +114,12 @@ def damaged(clean: CubeSet, family: str, severity: float) -> CubeSet:
     function = corrupt if family == MIXED else CORRUPTIONS[family]
     surface = clean.labels == SURFACE_LABEL
     place = 1000 * SEVERITIES.index(severity) + [MIXED, *CORRUPTIONS].index(family)
-    signed = np.stack([
-        signed_from_occupancy(function(np.random.default_rng([SEED, place, row]), cube, severity))
-        for row, cube in enumerate(surface)
-    ])  # fmt: skip
+    signed = np.stack(
+        [
+            signed_from_occupancy(function(np.random.default_rng([SEED, place, row]), cube, severity))
+            for row, cube in enumerate(surface)
+        ]
+    )
     about = {"family": family, "severity": severity}
     return dataclasses.replace(clean, name="synthetic", about=about, signed=signed.astype(np.float32))
 
@@ -177,9 +179,14 @@ def mesh_sets(meshes: Path, count: int, few: int) -> Iterator[CubeSet]:
         few: cubes of each single family.
     """
     base = dataclasses.replace(
-        load_recipe("meshes"), split="test", licences=("CC0-1.0", "MIT-0", "CC-BY-3.0"), empty_share=0.0,
-        on_share=0.8, near_share=0.2, cubes_per_mesh=4,
-    )  # fmt: skip
+        load_recipe("meshes"),
+        split="test",
+        licences=("CC0-1.0", "MIT-0", "CC-BY-3.0"),
+        empty_share=0.0,
+        on_share=0.8,
+        near_share=0.2,
+        cubes_per_mesh=4,
+    )
     with tempfile.TemporaryDirectory() as folder:
 
         def cut(name: str, **changes: Any) -> CubeSet:
@@ -210,7 +217,12 @@ def harvest_set(name: str, folder: Path, count: int) -> CubeSet:
 def capture_set(capture: Path, cache: Path, count: int) -> CubeSet:
     """Cubes of fields of a real capture (its first sweep), three seeds, labelled by a field that saw the third too."""
     shards = capture_shards(
-        capture, cubes_folder(cache, CAPTURE_CUBES), train="trajectory_1", better=("trajectory_3",),
-        cubes=CAPTURE_CUBES, seeds=(0, 1, 2), cache=cache,
-    )  # fmt: skip
+        capture,
+        cubes_folder(cache, CAPTURE_CUBES),
+        train="trajectory_1",
+        better=("trajectory_3",),
+        cubes=CAPTURE_CUBES,
+        seeds=(0, 1, 2),
+        cache=cache,
+    )
     return from_shards("capture", [read_shard(path) for path in shards], count)

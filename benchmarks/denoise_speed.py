@@ -61,8 +61,12 @@ def speed_row(model: Model, threads: int, **about: Any) -> dict[str, Any]:
 
 def _facts(manifest: Manifest) -> dict[str, Any]:
     training = manifest.training
-    return {"parameters": manifest.parameters, "gflop": training.get("gflop"), "channels": list(manifest.channels),
-            "precision": precision_of(manifest)}  # fmt: skip
+    return {
+        "parameters": manifest.parameters,
+        "gflop": training.get("gflop"),
+        "channels": list(manifest.channels),
+        "precision": precision_of(manifest),
+    }
 
 
 class _InTorch:

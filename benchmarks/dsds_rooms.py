@@ -87,8 +87,9 @@ class FittedRoom:
         rng = np.random.default_rng([options.seed, index])
         torch.manual_seed(0)
         self.index, self.threads, self.cubes = index, options.threads, options.cubes
-        self.photographed = photograph(rng, random_scene(rng), count=int(rng.integers(16, 25)), width=WIDTH,
-                                       height=WIDTH * 3 // 4)  # fmt: skip
+        self.photographed = photograph(
+            rng, random_scene(rng), count=int(rng.integers(16, 25)), width=WIDTH, height=WIDTH * 3 // 4
+        )
         self.field: Any = make_field("dense", options.resolution, initial_opacity=0.01, seed=index)
         samples = max(48, round(2.4 / self.field.field_pitch))
         sampling = Sampling(near_samples=samples, far_samples=max(12, samples // 4))
@@ -142,10 +143,13 @@ class FittedRoom:
         free, surface, now = self.labels == FREE_LABEL, self.labels == SURFACE_LABEL, after > RULE.threshold
         errors = np.concatenate([self._disparity_errors(field, index) for index in range(len(self.others[0]))])
         return {
-            "ghosts_removed": float((~now)[free & opaque].mean()), "surface_kept": float(now[surface & opaque].mean()),
-            "holes_filled": float(now[surface & ~opaque].mean()), "free_space_error": float(after[free].mean()),
-            "disparity_mae": float(errors.mean()), "disparity_median": float(np.median(errors)),
-        }  # fmt: skip
+            "ghosts_removed": float((~now)[free & opaque].mean()),
+            "surface_kept": float(now[surface & opaque].mean()),
+            "holes_filled": float(now[surface & ~opaque].mean()),
+            "free_space_error": float(after[free].mean()),
+            "disparity_mae": float(errors.mean()),
+            "disparity_median": float(np.median(errors)),
+        }
 
     def _disparity_errors(self, field: Any, index: int) -> NDArray[np.float64]:
         """Of one view of the other sweep, where a photo shows what it sees: per scene unit."""
@@ -182,9 +186,11 @@ def main() -> None:
         {"method": way, **{k: float(np.mean([one[k] for one in each])) for k in each[0] if k != "room"}, "rooms": each}
         for way, each in found.items()
     ]
-    command = f"python benchmarks/dsds_rooms.py --rooms {' '.join(map(str, options.rooms))} --seed {options.seed} " \
-              f"--resolution {options.resolution} --fit-steps {options.fit_steps} --steps {options.steps} " \
-              f"--cubes {options.cubes}"  # fmt: skip
+    command = (
+        f"python benchmarks/dsds_rooms.py --rooms {' '.join(map(str, options.rooms))} --seed {options.seed} "
+        f"--resolution {options.resolution} --fit-steps {options.fit_steps} --steps {options.steps} "
+        f"--cubes {options.cubes}"
+    )
     results = build_results(rows, command=command, seeds=[options.seed], threads=options.threads)
     write_results(options.out / "dsds_rooms.json", results)
 

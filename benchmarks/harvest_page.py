@@ -88,9 +88,11 @@ def write_sample(shards: list[Shard], target: Path) -> int:
     if target.exists():
         shutil.rmtree(target)
     provenance = {
-        "recipe": "harvest", "licence": "generated", "sample_of": f"{len(shards)} scenes",
+        "recipe": "harvest",
+        "licence": "generated",
+        "sample_of": f"{len(shards)} scenes",
         "scenes": [{k: s.provenance[k] for k in ("seed", "scene", "field", "resolution", "steps")} for s in chosen],
-    }  # fmt: skip
+    }
     write_shard(target, arrays, provenance)
     return sum(path.stat().st_size for path in target.iterdir())
 
@@ -150,10 +152,11 @@ def statistics_table(docs: Path) -> list[str]:
         cells = [f"{row[key]['mean']:.2f}" if key in row else "–" for key in keys]
         lines.append(f"| {row['method']} | {row['distance']:.3f} | {' | '.join(cells)} |")
     return [
-        *lines, "",
+        *lines,
+        "",
         f"Two random halves of the capture's cubes are at {results['sampling_floor']:.3f} from each other. "
         f"`{results['command']}`",
-    ]  # fmt: skip
+    ]
 
 
 def page(options: Options, found: dict[str, Any], sample_bytes: int) -> str:
@@ -163,36 +166,50 @@ def page(options: Options, found: dict[str, Any], sample_bytes: int) -> str:
     low, middle, high = found["psnr"]
     time = f", in about {options.seconds / 3600:.1f} hours of two cores' processor time" if options.seconds else ""
     asked = f" of {options.scenes} (in the others a fit failed or no free path was found)" if options.scenes else ""
-    return "\n".join([
-        "# The harvest", "",
-        "What a badly constrained field gets wrong is thick smooth fog, not blobs, and no synthetic corruption looks "
-        "like it. So the larger part of the training pairs is *harvested*: a synthetic room of known geometry is "
-        f"photographed along a casual sweep ({config.photos[0]}–{config.photos[1]} small photos with wrong exposures, "
-        "noise and poses that are slightly off), a radiance field is fitted to the photos, and not for long, and cubes "
-        "of its opacity become inputs. The signed distance of the room gives the labels. This page is written by "
-        "`python benchmarks/harvest_page.py`.", "",
-        f"**This one**: {found['pairs']:,} pairs of {found['scenes']} scenes{asked}{time}. "
-        f"Fields (kind, cells along an axis): {kinds}. PSNR on their own photos: {middle:.1f} dB (one in ten below "
-        f"{low:.1f}, one above {high:.1f}). {found['with_meshes']} scenes hold some of {found['meshes']} different "
-        "meshes beside procedural furniture.", "",
-        f"    unghost harvest --out out/harvest --scenes {options.scenes or found['scenes']} --seed 0 --workers 2 "
-        "--mesh-root MESHES", "",
-        "It can be killed and started again; scene i depends on (seed, i) alone. A frequency-encoded MLP is never "
-        "harvested for training (`--kinds mlp --seed 1` makes the set that is held out).", "",
-        "![six pairs, one a row](harvest/pairs.png)", "",
-        "Grey is true surface, **orange** a ghost, **blue** surface that the field lacks, violet what nobody judges: "
-        "inside solids and walls, the band about a surface, what no photo saw. A slice is the middle one along z; "
-        "opacities are drawn as their square roots, so that thin fog shows. `surroundings` is the same centre at "
-        "three times the edge; `views` counts the photos that have a voxel in their frustum, hidden or not.", "",
-        f"[A sample](harvest/sample) of {SAMPLE_CUBES} pairs ({sample_bytes / 1e6:.1f} MB, scenes without meshes) is "
-        "in the repository: `unghost preview docs/harvest/sample`.", "",
-        "## Does it look like a real capture's field?", "",
-        "Cubes of fields fitted to the first sweep of a real capture, cut as the harvest's are, against those of the "
-        "harvest and of the synthetic recipes. The distance (`unghost.data_recipes.statistics`) compares seven "
-        "features of the *input* alone: 0 for the same distributions, 1 at most.", "",
-        *statistics_table(options.docs), "",
-        "![distances, and distributions of the features](results/statistics.png)", "",
-    ])  # fmt: skip
+    return "\n".join(
+        [
+            "# The harvest",
+            "",
+            "What a badly constrained field gets wrong is thick smooth fog, not blobs, and no synthetic corruption "
+            "looks like it. So the larger part of the training pairs is *harvested*: a synthetic room of known geometry is "
+            f"photographed along a casual sweep ({config.photos[0]}–{config.photos[1]} small photos with wrong "
+            "exposures, noise and poses that are slightly off), a radiance field is fitted to the photos, and not for long, and "
+            "cubes of its opacity become inputs. The signed distance of the room gives the labels. This page is written by "
+            "`python benchmarks/harvest_page.py`.",
+            "",
+            f"**This one**: {found['pairs']:,} pairs of {found['scenes']} scenes{asked}{time}. "
+            f"Fields (kind, cells along an axis): {kinds}. PSNR on their own photos: {middle:.1f} dB (one in ten below "
+            f"{low:.1f}, one above {high:.1f}). {found['with_meshes']} scenes hold some of {found['meshes']} different "
+            "meshes beside procedural furniture.",
+            "",
+            f"    unghost harvest --out out/harvest --scenes {options.scenes or found['scenes']} --seed 0 --workers 2 "
+            "--mesh-root MESHES",
+            "",
+            "It can be killed and started again; scene i depends on (seed, i) alone. A frequency-encoded MLP is never "
+            "harvested for training (`--kinds mlp --seed 1` makes the set that is held out).",
+            "",
+            "![six pairs, one a row](harvest/pairs.png)",
+            "",
+            "Grey is true surface, **orange** a ghost, **blue** surface that the field lacks, violet what nobody judges: "
+            "inside solids and walls, the band about a surface, what no photo saw. A slice is the middle one along "
+            "z; opacities are drawn as their square roots, so that thin fog shows. `surroundings` is the same centre at "
+            "three times the edge; `views` counts the photos that have a voxel in their frustum, hidden or not.",
+            "",
+            f"[A sample](harvest/sample) of {SAMPLE_CUBES} pairs ({sample_bytes / 1e6:.1f} MB, scenes without meshes) "
+            "is in the repository: `unghost preview docs/harvest/sample`.",
+            "",
+            "## Does it look like a real capture's field?",
+            "",
+            "Cubes of fields fitted to the first sweep of a real capture, cut as the harvest's are, against those of "
+            "the harvest and of the synthetic recipes. The distance (`unghost.data_recipes.statistics`) compares seven "
+            "features of the *input* alone: 0 for the same distributions, 1 at most.",
+            "",
+            *statistics_table(options.docs),
+            "",
+            "![distances, and distributions of the features](results/statistics.png)",
+            "",
+        ]
+    )
 
 
 def main() -> None:

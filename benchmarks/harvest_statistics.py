@@ -131,9 +131,14 @@ def all_sets(options: Options, folder: Path) -> Iterator[tuple[str, CubeStatisti
     each = -(-options.cubes // len(options.seeds))
     cut = cubes_folder(options.cache, each)
     shards = capture_shards(
-        options.capture, cut, train=options.train, better=options.better, cubes=each, seeds=options.seeds,
+        options.capture,
+        cut,
+        train=options.train,
+        better=options.better,
+        cubes=each,
+        seeds=options.seeds,
         cache=options.cache,
-    )  # fmt: skip
+    )
     yield "capture", shard_statistics(shards, most=options.cubes)
     kinds = by_kind(options.harvest)
     yield "harvest", shard_statistics(list(itertools.chain(*kinds.values())), most=options.cubes)
@@ -172,8 +177,13 @@ def draw(path: Path, found: dict[str, CubeStatistics], rows: list[dict[str, Any]
     bars.set_title("distance to the capture's cubes")
     bars.tick_params(axis="y", labelsize=7)
     bars.legend(fontsize=7, loc="lower right")
-    shown = {"capture": "#b03a2e", "harvest": "#2a7f62", "harvest-unseen-field": "#1f5f99",
-             "procedural, soft": "#d08c1d", "procedural, bits": "#8a8a8a"}  # fmt: skip
+    shown = {
+        "capture": "#b03a2e",
+        "harvest": "#2a7f62",
+        "harvest-unseen-field": "#1f5f99",
+        "procedural, soft": "#d08c1d",
+        "procedural, bits": "#8a8a8a",
+    }
     for axis, feature in zip(axes.flat[1:], FEATURES):
         for name, color in shown.items():
             if name in found:
@@ -203,9 +213,13 @@ def main() -> None:
             found[name] = measured
     rows, floor = rows_of(found), sampling_floor(found["capture"])
     results = build_results(
-        rows, command=options.command(), seeds=[SEED, *options.seeds], capture=options.capture.resolve().name,
-        sampling_floor=round(floor, 4), harvest_scenes=len(find_shards(options.harvest)),
-    )  # fmt: skip
+        rows,
+        command=options.command(),
+        seeds=[SEED, *options.seeds],
+        capture=options.capture.resolve().name,
+        sampling_floor=round(floor, 4),
+        harvest_scenes=len(find_shards(options.harvest)),
+    )
     options.out.mkdir(parents=True, exist_ok=True)
     write_results(options.out / "statistics.json", results)
     draw(options.out / "statistics.png", found, rows, floor)

@@ -133,42 +133,68 @@ def section(name: str, path: Path, manifest: Manifest) -> list[str]:
         f"{manifest.default_timestep}; removal threshold {manifest.removal_threshold:.2f}, for `clean`: the largest of "
         f"those tried at which it keeps {chosen['kept']:g} of the surface of rooms made for that "
         f"(docs/results/threshold_{name}.json). Score distillation has thresholds of its own "
-        "(docs/regularizer.md).", "",
-        *table(("file", "size", "sha256"), files), "",
+        "(docs/regularizer.md).",
+        "",
+        *table(("file", "size", "sha256"), files),
+        "",
         f"From random weights: {' and then '.join(map(told, stages(training)))}, on two CPU cores "
         f"({training['precision']}), torch {training['torch']}. In harvested cubes, voxels that are opaque and true "
-        f"surface weigh {training['keep_weight']:g} times.", "",
-        *table(("source", "shards", "cubes", "share of the stream"), sources(training["shards"])), "",
-        "```", *train_commands(manifest), command, "```", "",
+        f"surface weigh {training['keep_weight']:g} times.",
+        "",
+        *table(("source", "shards", "cubes", "share of the stream"), sources(training["shards"])),
+        "",
+        "```",
+        *train_commands(manifest),
+        command,
+        "```",
+        "",
         *scores(name),
-    ]  # fmt: skip
+    ]
 
 
 def scores(name: str) -> list[str]:
     """The rows of the reference measurement about a model."""
     called = CALLED.get(name, name)
     rows = [
-        [row["method"].removeprefix(called).removeprefix(", ") or "–", row["set"],
-         str(row.get("severity", row.get("family", "–"))), str(row["cubes"]),
-         *(number(row[k]) for k in ("iou_before", "iou", "ghosts_removed_98", "ghosts_removed_90"))]
+        [
+            row["method"].removeprefix(called).removeprefix(", ") or "–",
+            row["set"],
+            str(row.get("severity", row.get("family", "–"))),
+            str(row["cubes"]),
+            *(number(row[k]) for k in ("iou_before", "iou", "ghosts_removed_98", "ghosts_removed_90")),
+        ]
         for row in load("denoise")["rows"]
         if row.get("model") == called and "cubes" in row and row.get("family", "mixed") in ("mixed", "bits", "soft")
-    ]  # fmt: skip
+    ]
     head = ("told", "set", "severity", "cubes", "IoU before", "after", "ghosts removed at .98 kept", "at .90")
     return [*table(head, rows), ""] if rows else []
 
 
 def card(name: str, path: Path, manifest: Manifest) -> str:
     lines = [
-        f"# {name}", "", ABOUT + (VIEWS if VIEW_COUNT in manifest.channels else ""), "",
+        f"# {name}",
+        "",
+        ABOUT + (VIEWS if VIEW_COUNT in manifest.channels else ""),
+        "",
         *section(name, path, manifest),
-        "## The data", "", "```", DATA, "```", "", LICENCES, "",
+        "## The data",
+        "",
+        "```",
+        DATA,
+        "```",
+        "",
+        LICENCES,
+        "",
         "Scores above are of the reference measurement (`benchmarks/denoise.py`, docs/results/denoise.json), on what "
         "was not trained on: cubes of meshes of the `test` split, of fields fitted to scenes 128 to 139 of the "
         "harvest's seed (129 and 134 were watched while it trained; nothing was chosen by them), of MLP fields, of a "
-        "real capture's field. Ghosts removed: one threshold for a set.", "",
-        "## Limits", "", LIMITS + (SEEN_GHOSTS if VIEW_COUNT in manifest.channels else ""), "",
-    ]  # fmt: skip
+        "real capture's field. Ghosts removed: one threshold for a set.",
+        "",
+        "## Limits",
+        "",
+        LIMITS + (SEEN_GHOSTS if VIEW_COUNT in manifest.channels else ""),
+        "",
+    ]
     return "\n".join(lines)
 
 

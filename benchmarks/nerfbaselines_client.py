@@ -71,8 +71,9 @@ def scene() -> tuple[PseudoTruth, np.ndarray, np.ndarray, np.ndarray]:
     return truth, photos, colours, depth
 
 
-def evaluate(folder: Path, protocol: type[MaskedProtocol], maps: PseudoTruth, arrays: tuple[np.ndarray, ...],
-             root: Path) -> dict[str, object]:  # fmt: skip
+def evaluate(
+    folder: Path, protocol: type[MaskedProtocol], maps: PseudoTruth, arrays: tuple[np.ndarray, ...], root: Path
+) -> dict[str, object]:
     """Render through nerfbaselines, score by its command, and beside it directly."""
     import nerfbaselines
     from nerfbaselines.evaluation import build_evaluation_protocol, render_all_images
@@ -83,20 +84,25 @@ def evaluate(folder: Path, protocol: type[MaskedProtocol], maps: PseudoTruth, ar
     poses = maps.eval_cameras.camera_to_world.astype(np.float32) * np.array([1, -1, -1, 1], dtype=np.float32)
     dataset = nerfbaselines.new_dataset(
         cameras=nerfbaselines.new_cameras(
-            poses=poses, intrinsics=maps.eval_cameras.intrinsics.astype(np.float32),
+            poses=poses,
+            intrinsics=maps.eval_cameras.intrinsics.astype(np.float32),
             camera_models=np.zeros(len(poses), dtype=np.int32),
             image_sizes=np.tile(np.array([WIDTH, HEIGHT], dtype=np.int32), (len(poses), 1)),
             nears_fars=np.tile(np.array([0.1, 10.0], dtype=np.float32), (len(poses), 1)),
         ),
-        image_paths=[str(root / each) for each in maps.names], image_paths_root=str(root), images=list(photos),
-        mask_paths=[str(root / each) for each in maps.names], mask_paths_root=str(root),
+        image_paths=[str(root / each) for each in maps.names],
+        image_paths_root=str(root),
+        images=list(photos),
+        mask_paths=[str(root / each) for each in maps.names],
+        mask_paths_root=str(root),
         masks=[np.where(each, 255, 0).astype(np.uint8) for each in visible],
         metadata={"color_space": "srgb", "evaluation_protocol": name, "name": "wall", "id": "wall"},
-    )  # fmt: skip
+    )
     info = {"method": "toy", "num_iterations": 1, "dataset_metadata": dataset["metadata"]}
     found = build_evaluation_protocol(name)
-    for _ in render_all_images(Toy(colours, depth), dataset, str(folder / "predictions"), nb_info=info,
-                               evaluation_protocol=found):  # fmt: skip
+    for _ in render_all_images(
+        Toy(colours, depth), dataset, str(folder / "predictions"), nb_info=info, evaluation_protocol=found
+    ):
         pass
     command = [str(Path(sys.executable).with_name("nerfbaselines")), "evaluate", str(folder / "predictions")]
     done = subprocess.run(
@@ -116,9 +122,12 @@ def evaluate(folder: Path, protocol: type[MaskedProtocol], maps: PseudoTruth, ar
     if apart > NEAR or theirs["evaluation_protocol"] != name:
         raise SystemExit(f"{name}: nerfbaselines says {pairs}, under {theirs['evaluation_protocol']}")
     return {
-        "method": name, "convention": protocol.convention, **{key: first for key, (first, _) in pairs.items()},
-        "largest_difference": apart, "masks": bool(os.environ.get(MASKS_VARIABLE)),
-    }  # fmt: skip
+        "method": name,
+        "convention": protocol.convention,
+        **{key: first for key, (first, _) in pairs.items()},
+        "largest_difference": apart,
+        "masks": bool(os.environ.get(MASKS_VARIABLE)),
+    }
 
 
 def whole_metrics(photos: np.ndarray, colours: np.ndarray, maps: PseudoTruth) -> dict[str, float]:
@@ -129,9 +138,11 @@ def whole_metrics(photos: np.ndarray, colours: np.ndarray, maps: PseudoTruth) ->
     first, second = (each[:2].astype(np.float32) / 255 * masks[..., None] for each in (colours, photos))
     depth = np.ones(masks.shape)
     found = score_scene(
-        Renders(colours[:2].astype(np.float32) / 255, depth), Truth(photos[:2].astype(np.float32) / 255, masks),
-        maps.extent, convention="nerfbaselines",
-    ).means()  # fmt: skip
+        Renders(colours[:2].astype(np.float32) / 255, depth),
+        Truth(photos[:2].astype(np.float32) / 255, masks),
+        maps.extent,
+        convention="nerfbaselines",
+    ).means()
     return {
         "psnr_apart": abs(float(np.mean(metrics.psnr(metrics.mse(first, second)))) - found["psnr"]),
         "ssim_apart": abs(float(np.mean(metrics.ssim(second, first))) - found["ssim"]),

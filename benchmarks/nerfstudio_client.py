@@ -103,12 +103,22 @@ def train(config: NerfactoModelConfig, data: Any, images: torch.Tensor, steps: i
             history.append({name: float(value) for name, value in losses.items() if name.startswith("unghost")})
             if not all(np.isfinite(list(history[-1].values()))):
                 raise SystemExit(f"step {step}: {history[-1]}")
-    row = {"steps": steps, "rays": rays, "rgb_loss": float(losses["rgb_loss"]),
-           "milliseconds": 1e3 * statistics.median(plain[3:]), "opacity_unseen": unseen(model, data)}  # fmt: skip
+    row = {
+        "steps": steps,
+        "rays": rays,
+        "rgb_loss": float(losses["rgb_loss"]),
+        "milliseconds": 1e3 * statistics.median(plain[3:]),
+        "opacity_unseen": unseen(model, data),
+    }
     if history:
-        row |= {"milliseconds_regularized": 1e3 * statistics.median(extra[1:]), "regularized_steps": len(history),
-                "first": history[0], "last": history[-1], "fields": gradients(model),
-                "contraction_error": contraction_error(model, data)}  # fmt: skip
+        row |= {
+            "milliseconds_regularized": 1e3 * statistics.median(extra[1:]),
+            "regularized_steps": len(history),
+            "first": history[0],
+            "last": history[-1],
+            "fields": gradients(model),
+            "contraction_error": contraction_error(model, data),
+        }
         row |= step_cost(model)
     return row
 

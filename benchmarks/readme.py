@@ -51,15 +51,27 @@ def denoise(results: dict[str, Any]) -> list[str]:
     rows = results["rows"]
     speeds = {row["method"]: row for row in rows if "cubes_per_second" in row}
     smaller = tuple(name for name in speeds if name.endswith(("-fp16", "-int8")))  # in the table of models
-    shown = [name for name in dict.fromkeys(row["method"] for row in rows if row["set"] != "speed")
-             if "@" not in name and not name.startswith(smaller or ("\n",))]  # fmt: skip
+    shown = [
+        name
+        for name in dict.fromkeys(row["method"] for row in rows if row["set"] != "speed")
+        if "@" not in name and not name.startswith(smaller or ("\n",))
+    ]
     methods = [name for name in shown if any(row["method"] == name and row["set"] == "clean" for row in rows)]
     found = {(row["method"], row["set"], row.get("family"), row.get("severity")): row for row in rows}
     severities = results["severities"]
-    wanted = [("clean", None, None), *(("synthetic", "mixed", severity) for severity in severities),
-              ("synthetic-in-a-field", None, 0.8)]  # fmt: skip
-    head = ["method", "untouched", *(f"severity {severity:g}" for severity in severities), "0.8, in a field",
-            "bubbles", "cubes/s"]  # fmt: skip
+    wanted = [
+        ("clean", None, None),
+        *(("synthetic", "mixed", severity) for severity in severities),
+        ("synthetic-in-a-field", None, 0.8),
+    ]
+    head = [
+        "method",
+        "untouched",
+        *(f"severity {severity:g}" for severity in severities),
+        "0.8, in a field",
+        "bubbles",
+        "cubes/s",
+    ]
     lines = []
     for method in methods:
         ious = [number(found[(method, *key)]["iou"]) for key in wanted]
@@ -70,33 +82,41 @@ def denoise(results: dict[str, Any]) -> list[str]:
         lines.append([method, *ious, bubbles, speed])
     text = [
         "**Cubes of meshes that were never trained on**, one step at the default timestep (mean IoU with the truth, "
-        f"{found['input', 'clean', None, None]['cubes']} cubes each):", "",
-        *table(head, lines), "",
+        f"{found['input', 'clean', None, None]['cubes']} cubes each):",
+        "",
+        *table(head, lines),
+        "",
         "In a field: the same cubes at the edge fraction of a window of `clean` (.5), so that it must be no hint about "
         "the content. Bubbles, too: closed smooth bodies beside the untouched surfaces, as bits / as soft opacities; "
-        "the share of them that is gone when .98 of the surface stays.", "",
-    ]  # fmt: skip
+        "the share of them that is gone when .98 of the surface stays.",
+        "",
+    ]
     foggy = [name for name in FOG if ("input", name, None, None) in found]
     if foggy:
         lines = [[method, *(_removed(found[method, name, None, None]) for name in foggy)] for method in shown]
         text += [
             "**Cubes of badly constrained fields**: ghost voxels removed while .98 / .90 of the true ones stay, one "
-            "threshold for all cubes of a set:", "",
-            *table(["method", *(FOG[name] for name in foggy)], lines), "",
+            "threshold for all cubes of a set:",
+            "",
+            *table(["method", *(FOG[name] for name in foggy)], lines),
+            "",
             *(f"{line}\n" for line in (_beaten(found, name, shown) for name in foggy) if line),
             "`unghost` is the default, `m` an older, larger and `xs` a smaller one; `views` is told who looks where, "
             "and blind it is not. The diffusions are compact ones after short training ([the prior](docs/prior.md)), "
-            "shown at timestep 50; at 10 and 100 they are in docs/results/denoise.json.", "",
-        ]  # fmt: skip
+            "shown at timestep 50; at 10 and 100 they are in docs/results/denoise.json.",
+            "",
+        ]
     speed = next(iter(speeds.values()))
     bare = [f"{name} {row['cubes_per_second']:.1f}" for name, row in speeds.items() if not row.get("trained", True)]
     said = f" Not trained, so nothing but their speed can be told: {', '.join(bare)} cubes/s." if bare else ""
     return [
         *text,
-        *table(MODEL_HEAD, (_model(row, found) for row in speeds.values() if row.get("trained", True))), "",
-        f"Speed with batches of {speed['batch']} and {speed['threads']} threads.{said}", "",
+        *table(MODEL_HEAD, (_model(row, found) for row in speeds.values() if row.get("trained", True))),
+        "",
+        f"Speed with batches of {speed['batch']} and {speed['threads']} threads.{said}",
+        "",
         "![speed against error](docs/results/denoise.png)",
-    ]  # fmt: skip
+    ]
 
 
 MODEL_HEAD = (
@@ -119,8 +139,16 @@ def _model(row: Row, found: dict[Any, Row]) -> list[str]:
     ious = [number(found[(row["method"], *key)]["iou"]) for key in wanted]
     speeds = [f"{row[key]:.0f}" if key in row else "–" for key in ("cubes_per_second", "torch_cubes_per_second")]
     seen = ", ".join(name.removeprefix("signed_").replace("_count", "s") for name in row["channels"])
-    return [row["method"], seen, *ious, str(row["parameters"]), number(row["gflop"], 2), number(row["megabytes"], 2),
-            row["precision"], *speeds]  # fmt: skip
+    return [
+        row["method"],
+        seen,
+        *ious,
+        str(row["parameters"]),
+        number(row["gflop"], 2),
+        number(row["megabytes"], 2),
+        row["precision"],
+        *speeds,
+    ]
 
 
 def _beaten(found: dict[Any, Row], name: str, shown: list[str]) -> str:
@@ -154,19 +182,28 @@ def channels(results: dict[str, Any]) -> list[str]:
     head = ["the network sees", "IoU, untouched", "IoU, corrupted", *FOG.values()]
     return [
         f"**What should it see?** The same small network ({results['size']}), data and {results['steps']} steps each, "
-        "with more and more of what is known about a cube; ghosts removed while .98 / .90 of the true voxels stay:", "",
-        *table(head, lines), "",
+        "with more and more of what is known about a cube; ghosts removed while .98 / .90 of the true voxels stay:",
+        "",
+        *table(head, lines),
+        "",
         "How many training photos have a voxel in their frustum (views) helps most; the largest share of light that "
         "one of them gets from it through the field itself (transmittance) helps on scenes like those trained on and "
         "on the capture, not on another kind of field; the surroundings (the same centre, three times the edge) add "
         "little. Of the shipped priors `views` takes view counts too, the others see the opacity alone.",
-    ]  # fmt: skip
+    ]
 
 
 def statistics(results: dict[str, Any]) -> list[str]:
     distances = {row["method"]: row["distance"] for row in results["rows"]}
-    shown = ("harvest, dense fields", "harvest", "harvest-unseen-field", "rooms", "meshes", "procedural, soft",
-             "procedural, bits")  # fmt: skip
+    shown = (
+        "harvest, dense fields",
+        "harvest",
+        "harvest-unseen-field",
+        "rooms",
+        "meshes",
+        "procedural, soft",
+        "procedural, bits",
+    )
     lines = [[name, number(distances[name])] for name in shown if name in distances]
     return [
         "**Do training cubes look like a real capture's field?** Distance of what the cubes show, in [0, 1]; two "
@@ -189,10 +226,14 @@ def capture(results: dict[str, Any]) -> list[str]:
     return [
         f"**A real capture** ({results['capture']}: trained on one sweep of phone photos, scored on another; the "
         f"paper's masks, depth limit {results['depth_limit']:.2f}, {seeds} seed(s), DSDS with "
-        f"{called}):", "",
-        *table(head, rows), "", verdict({row["method"]: row for row in results["rows"]}), "",
+        f"{called}):",
+        "",
+        *table(head, rows),
+        "",
+        verdict({row["method"]: row for row in results["rows"]}),
+        "",
         "![photo, (a), (b), (c), colour and depth](docs/results/capture.png)",
-    ]  # fmt: skip
+    ]
 
 
 def verdict(rows: dict[str, Row]) -> str:
@@ -219,9 +260,10 @@ def curate(results: dict[str, Any]) -> list[str]:
     head = ("cubes", "a second", "processor ms a cube", "IoU with ours")
     return [
         "**Making cubes** (two processes; mesh rows: a bumpy ball of 70,000 faces, from choosing where the cube lies "
-        "to its packed bits, no corruption):", "",
+        "to its packed bits, no corruption):",
+        "",
         *table(head, rows),
-    ]  # fmt: skip
+    ]
 
 
 def splats(results: dict[str, Any]) -> list[str]:
@@ -234,16 +276,26 @@ def splats(results: dict[str, Any]) -> list[str]:
         seconds = sorted(row["seconds"] for row in rows)
         worst = number(min(row["surface_kept"] for row in rows))
         lines.append([method, *means, worst, number(seconds[len(seconds) // 2], 1)])
-    head = ("method", "floaters removed", "clusters", "haze", "needles", "true splats kept", "in the worst room",
-            "seconds")  # fmt: skip
+    head = (
+        "method",
+        "floaters removed",
+        "clusters",
+        "haze",
+        "needles",
+        "true splats kept",
+        "in the worst room",
+        "seconds",
+    )
     count = results["rows"][0]["splats"]
     return [
         f"**3D Gaussian splats**: {len(results['seeds'])} furnished rooms of {count:,} splats, "
         f"{results['floaters']:.0%} of them floaters put there; no photos; the others with the parameters that people "
-        "copy:", "",
-        *table(head, lines), "",
+        "copy:",
+        "",
+        *table(head, lines),
+        "",
         "The largest component is perfect, and nearly free, where all that is true hangs together.",
-    ]  # fmt: skip
+    ]
 
 
 def two_trajectory(results: dict[str, Any]) -> list[str]:
@@ -252,8 +304,17 @@ def two_trajectory(results: dict[str, Any]) -> list[str]:
     own = ("psnr", "coverage", "free_space_error", "cpu_seconds")
     digits = dict(zip((*equal, *own), (2, 2, 2, 3, 2, 3, 4, 0)))
     lines = [[row["method"], *(number(row[key], digits[key]) for key in (*equal, *own))] for row in rows]
-    head = ("method", "PSNR, equal coverage", "mean over coverages", "all cut by photo doubt", "disparity error, mean",
-            "PSNR, own coverage", "coverage", "opacity in free space", "CPU seconds")  # fmt: skip
+    head = (
+        "method",
+        "PSNR, equal coverage",
+        "mean over coverages",
+        "all cut by photo doubt",
+        "disparity error, mean",
+        "PSNR, own coverage",
+        "coverage",
+        "opacity in free space",
+        "CPU seconds",
+    )
     scenes = sorted({scene for row in rows for scene in row["scenes"]})
     (convention,), most = {row["convention"] for row in rows}, max(row["runs"] for row in rows)
     fewer = ", ".join(f"`{row['method']}` {row['runs']}" for row in rows if row["runs"] < most)
@@ -262,19 +323,27 @@ def two_trajectory(results: dict[str, Any]) -> list[str]:
         f"({', '.join(scenes)}), convention `{convention}`, {most} runs a method{f' ({fewer})' if fewer else ''}, "
         "equal steps for all that train. `pseudo-gt` has seen what it is scored on, and its fit is not in the seconds. "
         "The first four columns cut every method to the lowest coverage among them, and to all from .1 up to it, in "
-        "its own order of pixels or all by photo doubt:", "",
-        *table(head, lines), "",
+        "its own order of pixels or all by photo doubt:",
+        "",
+        *table(head, lines),
+        "",
         "Who wins where, the knobs, the curves and the paper's ablation, us losing included: "
-        "[docs/results](docs/results/README.md).", "",
+        "[docs/results](docs/results/README.md).",
+        "",
         "![score over coverage](docs/results/two_trajectory.png)",
-    ]  # fmt: skip
+    ]
 
 
 SECTIONS = {
-    "demo": demo, "splats": splats, "two_trajectory": two_trajectory, "denoise": denoise, "channels": channels,
+    "demo": demo,
+    "splats": splats,
+    "two_trajectory": two_trajectory,
+    "denoise": denoise,
+    "channels": channels,
     "capture": capture,
-    "statistics": statistics, "curate": curate,
-}  # fmt: skip
+    "statistics": statistics,
+    "curate": curate,
+}
 
 
 def made_by(results: dict[str, Any]) -> str:

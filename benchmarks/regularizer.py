@@ -111,8 +111,13 @@ def step_row(name: str, denoiser: Any, room: GridField, repeats: int, cameras: C
 
     seconds, _ = median_seconds(step, repeats)
     alone, _ = median_seconds(queries, repeats)
-    return {"method": f"dsds step, {name}", "cubes": regularizer.settings.cubes, "seconds": seconds,
-            "seconds_of_queries": alone, "seconds_beside": seconds - alone}  # fmt: skip
+    return {
+        "method": f"dsds step, {name}",
+        "cubes": regularizer.settings.cubes,
+        "seconds": seconds,
+        "seconds_of_queries": alone,
+        "seconds_beside": seconds - alone,
+    }
 
 
 def nerfstudio_count(cameras: Cameras, points: torch.Tensor) -> torch.Tensor:
@@ -159,11 +164,20 @@ def visibility_rows(options: Options) -> list[dict[str, Any]]:
     truth, rows = cameras.view_count(points) > 0, []
     for name, way in ways.items():
         seconds, found = median_seconds(way, options.repeats)
-        rows.append({"method": f"visibility, {name}", "points": POINTS, "cameras": len(cameras), "seconds": seconds,
-                     "tests_per_second": POINTS * len(cameras) / seconds,
-                     "disagreement": float(((found > 0) != truth).mean())})  # fmt: skip
-        say(f"{name}: {seconds * 1e3:.1f} ms, {rows[-1]['tests_per_second'] / 1e6:.0f} M tests/s, "
-            f"{rows[-1]['disagreement']:.2%} differ")  # fmt: skip
+        rows.append(
+            {
+                "method": f"visibility, {name}",
+                "points": POINTS,
+                "cameras": len(cameras),
+                "seconds": seconds,
+                "tests_per_second": POINTS * len(cameras) / seconds,
+                "disagreement": float(((found > 0) != truth).mean()),
+            }
+        )
+        say(
+            f"{name}: {seconds * 1e3:.1f} ms, {rows[-1]['tests_per_second'] / 1e6:.0f} M tests/s, "
+            f"{rows[-1]['disagreement']:.2%} differ"
+        )
     return rows
 
 

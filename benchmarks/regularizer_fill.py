@@ -51,10 +51,14 @@ def fill_row(name: str, *, steps: int, target: float | None = None, seed: int = 
         optimizer.step()
     found = np.asarray(RULE.occupied(field.cells().detach().numpy(), room.pitch))
     row = {
-        "method": f"filling, {name}", "target": -math.expm1(-regularizer.settings.target_density()), "steps": steps,
-        "holes": HOLES, "cells_missing": int((solid & missing).sum()),
-        "holes_filled": float(found[solid & missing].mean()), "surface_kept": float(found[solid & ~missing].mean()),
+        "method": f"filling, {name}",
+        "target": -math.expm1(-regularizer.settings.target_density()),
+        "steps": steps,
+        "holes": HOLES,
+        "cells_missing": int((solid & missing).sum()),
+        "holes_filled": float(found[solid & missing].mean()),
+        "surface_kept": float(found[solid & ~missing].mean()),
         "cells_added": float((found & ~room.surface(RULE)).sum() / solid.sum()),
-    }  # fmt: skip
+    }
     say(" ".join(f"{key} {value:.3f}" if isinstance(value, float) else str(value) for key, value in row.items()))
     return row

@@ -38,14 +38,23 @@ def overhead_rows(
         field, hooks = copy.deepcopy(base), dict[str, Any]()
         if settings is not None:
             regularizer = DensityRegularizer(
-                load_denoiser(name, backend="onnx", threads=threads), aabb=field.aabb, cameras=cameras,
-                field_pitch=field.field_pitch, **settings,
-            )  # fmt: skip
+                load_denoiser(name, backend="onnx", threads=threads),
+                aabb=field.aabb,
+                cameras=cameras,
+                field_pitch=field.field_pitch,
+                **settings,
+            )
             hooks = training_hooks(regularizer)
             regularizer(field.density_fn)  # what is built once is not counted
         record = train_field(field, cameras, photos, steps=steps, fine_tune=True, **hooks)
         seconds = record["seconds"] / record["steps"]
-        rows.append({"method": f"own field's step, {way}", "seconds": seconds,
-                     "times_alone": seconds / rows[0]["seconds"] if rows else 1.0, "steps": steps})  # fmt: skip
+        rows.append(
+            {
+                "method": f"own field's step, {way}",
+                "seconds": seconds,
+                "times_alone": seconds / rows[0]["seconds"] if rows else 1.0,
+                "steps": steps,
+            }
+        )
         say(f"{rows[-1]['method']}: {seconds:.3f} s, {rows[-1]['times_alone']:.2f} x")
     return rows

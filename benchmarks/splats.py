@@ -115,11 +115,25 @@ def make(seed: int, options: Options) -> Scene:
     turns = [rng.normal(size=(count, 4)) for count in each]
     places = free[rng.integers(0, len(free), 60)][rng.integers(0, 60, each[0])]
     blob = places + rng.normal(0, 0.025, places.shape)
-    parts.append((blob, rng.lognormal(np.log(0.012 * deep), 0.5, (each[0], 3)), turns[0], rng.normal(0, 1.5, each[0]),
-                  np.full(each[0], 1)))  # fmt: skip
+    parts.append(
+        (
+            blob,
+            rng.lognormal(np.log(0.012 * deep), 0.5, (each[0], 3)),
+            turns[0],
+            rng.normal(0, 1.5, each[0]),
+            np.full(each[0], 1),
+        )
+    )
     haze = free[rng.integers(0, len(free), each[1])]
-    parts.append((haze, rng.lognormal(np.log(0.04 * deep), 0.4, (each[1], 3)), turns[1], rng.normal(-2.5, 0.8, each[1]),
-                  np.full(each[1], 2)))  # fmt: skip
+    parts.append(
+        (
+            haze,
+            rng.lognormal(np.log(0.04 * deep), 0.4, (each[1], 3)),
+            turns[1],
+            rng.normal(-2.5, 0.8, each[1]),
+            np.full(each[1], 2),
+        )
+    )
     needle = free[rng.integers(0, len(free), each[2])]
     thin = rng.lognormal(np.log(0.004 * deep), 0.3, (each[2], 3)) * [15, 1, 1]
     parts.append((needle, thin, turns[2], rng.normal(0, 1.5, each[2]), np.full(each[2], 3)))
@@ -180,9 +194,12 @@ def ours(gaussians: Gaussians) -> Mask:
 
 
 METHODS: dict[str, Callable[[Gaussians], Mask]] = {
-    "unghost": ours, "statistical outliers": statistical, "radius outliers": radius, "opacity": faint,
+    "unghost": ours,
+    "statistical outliers": statistical,
+    "radius outliers": radius,
+    "opacity": faint,
     "largest component": component,
-}  # fmt: skip
+}
 
 
 def row_of(name: str, seed: int, scene: Scene) -> dict[str, Any]:
@@ -190,8 +207,14 @@ def row_of(name: str, seed: int, scene: Scene) -> dict[str, Any]:
     keep = METHODS[name](scene.gaussians)
     seconds = time.perf_counter() - begun
     ghost = scene.kind > 0
-    row = {"method": name, "seed": seed, "splats": len(keep), "floater_recall": float((~keep)[ghost].mean()),
-           "surface_kept": float(keep[~ghost].mean()), "seconds": seconds}  # fmt: skip
+    row = {
+        "method": name,
+        "seed": seed,
+        "splats": len(keep),
+        "floater_recall": float((~keep)[ghost].mean()),
+        "surface_kept": float(keep[~ghost].mean()),
+        "seconds": seconds,
+    }
     row |= {f"recall_{kind}": float((~keep)[scene.kind == index].mean()) for index, kind in enumerate(KINDS) if index}
     say(" ".join(f"{key}={value:.3f}" if isinstance(value, float) else f"{value}" for key, value in row.items()))
     return row

@@ -94,8 +94,9 @@ def no_densities(dtype: torch.dtype) -> None:
     for made in (np.bool_, np.complex64, np.str_):
         refuses(
             lambda m=made: clean(lambda p: np.ones(len(p), m), BOX, denoiser=Fixed(None), resolution=16),
-            TypeError, "integers or floating-point",
-        )  # fmt: skip
+            TypeError,
+            "integers or floating-point",
+        )
     clean(lambda p: np.full(len(p), 3), BOX, denoiser=Fixed(None), resolution=16)
 
 
@@ -220,38 +221,63 @@ CASES = [
     Case("density 1e30", FINITE, lambda t: constant(1e30, t), BRAIN),
     Case("the largest density (3.4e38; 65504)", FINITE, lambda t: constant(largest(t), t)),
     Case("the same under the paper's rule (raw densities)", FINITE, huge_sum),
-    Case("density NaN", "`ValueError` with count and first position; `drop_invalid=True` leaves them out and counts",
-         lambda t: raises(math.nan, t)),
+    Case(
+        "density NaN",
+        "`ValueError` with count and first position; `drop_invalid=True` leaves them out and counts",
+        lambda t: raises(math.nan, t),
+    ),
     Case("density inf", "the same", lambda t: raises(math.inf, t)),
     Case("density −1", "the same", lambda t: raises(-1.0, t)),
-    Case("densities that are truth values, complex or text", "`TypeError` with the dtype; integers too, but for "
-         "`clean`, which needs no gradient", no_densities, SINGLE),
+    Case(
+        "densities that are truth values, complex or text",
+        "`TypeError` with the dtype; integers too, but for `clean`, which needs no gradient",
+        no_densities,
+        SINGLE,
+    ),
     Case("densities on another device than the positions", "`ValueError` with both", elsewhere),
-    Case("the same density at every place of the box", "`UserWarning`, once: does the callable use its positions?",
-         lambda t: warns(torch.tensor(2.0, dtype=t, requires_grad=True), "does it use its positions")),
-    Case("densities without a gradient where one is wanted", "`UserWarning`, once: detached, frozen, under `no_grad`?",
-         lambda t: warns(torch.tensor(2.0, dtype=t), "without a gradient")),
-    Case("a smooth field", "half precision is upcast to float32: the error is the rounding of the densities",
-         precision),
+    Case(
+        "the same density at every place of the box",
+        "`UserWarning`, once: does the callable use its positions?",
+        lambda t: warns(torch.tensor(2.0, dtype=t, requires_grad=True), "does it use its positions"),
+    ),
+    Case(
+        "densities without a gradient where one is wanted",
+        "`UserWarning`, once: detached, frozen, under `no_grad`?",
+        lambda t: warns(torch.tensor(2.0, dtype=t), "without a gradient"),
+    ),
+    Case(
+        "a smooth field", "half precision is upcast to float32: the error is the rounding of the densities", precision
+    ),
     Case("`clean` of a smooth field", "as above; largest difference of a score in [−1, 1]", cleaned),
     Case("scene unit × 1e6", "the same losses (opacity rule)", lambda _: unit(1e6), SINGLE),
     Case("scene unit × 1e-6", "the same losses (opacity rule)", lambda _: unit(1e-6), SINGLE),
-    Case("a box 1e5 units from the origin", "positions are float32: rounded to 1/128 unit there; move the scene",
-         lambda _: far_away(), SINGLE),
+    Case(
+        "a box 1e5 units from the origin",
+        "positions are float32: rounded to 1/128 unit there; move the scene",
+        lambda _: far_away(),
+        SINGLE,
+    ),
     Case("a cube sticking out of the box (7/8 of it)", "shown as empty there, never asked, not in the mean", outside),
     Case("a camera centre inside a cube", "as any other cube", camera_inside),
-    Case("points on or behind the camera plane", "unseen; exactly on the plane, at the centre too, is unseen",
-         lambda _: camera_plane(), SINGLE),
+    Case(
+        "points on or behind the camera plane",
+        "unseen; exactly on the plane, at the centre too, is unseen",
+        lambda _: camera_plane(),
+        SINGLE,
+    ),
     Case("an all-empty cube, answer empty", "loss 0, nothing removed", lambda t: uniform_cube(0.0, -1.0, t)),
     Case("an all-empty cube, answer full", "filled up to w; `clean` never adds", lambda t: uniform_cube(0.0, 1.0, t)),
     Case("an all-full cube, answer full", "loss 0, nothing removed", lambda t: uniform_cube(1e4, 1.0, t)),
-    Case("an all-full cube, answer empty", "all of it pushed out, all of it removed",
-         lambda t: uniform_cube(1e4, -1.0, t)),
+    Case(
+        "an all-full cube, answer empty",
+        "all of it pushed out, all of it removed",
+        lambda t: uniform_cube(1e4, -1.0, t),
+    ),
     Case("t = 0", FINITE, lambda t: timestep(0, t)),
     Case("t = 999", FINITE, lambda t: timestep(999, t)),
     Case("a batch of 0: no cubes, no points", "exactly 0", lambda _: nothing(), SINGLE),
     *LOSS_CASES,
-]  # fmt: skip
+]
 
 HEAD = ("| input | behaviour | float32 | float16 | bfloat16 |", "|---|---|---|---|---|")
 

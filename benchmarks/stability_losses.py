@@ -191,15 +191,31 @@ def distill(density: torch.Tensor) -> torch.Tensor:
 
 
 LOSS_CASES = [
-    Case("densities in float16, gradient", "a voxel's share of a mean over a million, times a weight, can underflow to "
-         "0 in float16: scale the loss (`GradScaler`) or give densities in float32", half_gradient, (torch.float16,)),
-    Case("densities in float64, beyond 1e300", "finite gradients; a loss is inf where `density · pitch` is beyond "
-         "1.8e308, or the square of a depth's difference", largest_float64, SINGLE),
-    Case("total variation, densities 0 to the largest", "finite, in float64; no square of more than 1 is taken",
-         rival(total_variation_loss)),
+    Case(
+        "densities in float16, gradient",
+        "a voxel's share of a mean over a million, times a weight, can underflow to "
+        "0 in float16: scale the loss (`GradScaler`) or give densities in float32",
+        half_gradient,
+        (torch.float16,),
+    ),
+    Case(
+        "densities in float64, beyond 1e300",
+        "finite gradients; a loss is inf where `density · pitch` is beyond "
+        "1.8e308, or the square of a depth's difference",
+        largest_float64,
+        SINGLE,
+    ),
+    Case(
+        "total variation, densities 0 to the largest",
+        "finite, in float64; no square of more than 1 is taken",
+        rival(total_variation_loss),
+    ),
     Case("total variation where nothing changes", "0, gradient 0", flat),
-    Case("sparsity, densities 0 to the largest", "between 0 and 1; small densities keep their digits (`expm1`)",
-         rival(lambda d: sparsity_loss(d, length=0.05), 0.0, 1.0)),
+    Case(
+        "sparsity, densities 0 to the largest",
+        "between 0 and 1; small densities keep their digits (`expm1`)",
+        rival(lambda d: sparsity_loss(d, length=0.05), 0.0, 1.0),
+    ),
     Case("free-space prior, densities 0 to the largest", "between 1/2 and 1", rival(free_space_loss, 0.5, 1.0)),
     Case("depth smoothness, depths 0 to the largest", "finite, in float64", rival(depth_smoothness_loss)),
     Case("depth smoothness, rays that meet nothing (inf)", "no difference to their neighbours: 0, gradient 0", sky),
@@ -210,4 +226,4 @@ LOSS_CASES = [
     Case("densities squashed by a clamp", "between −1 and 1", rival(squash("clamp"), -1.0, 1.0)),
     Case("densities squashed by a sigmoid", "between −1 and 1.005", rival(squash("sigmoid"), -1.0 - 1e-6, 1.005)),
     Case("score distillation of those", "between 0 and .2424 (a = .36)", rival(distill, 0.0, 0.2424)),
-]  # fmt: skip
+]

@@ -38,21 +38,31 @@ def configured(name: str, options: argparse.Namespace) -> TrainConfig:
     """The run of that name with the options of the command line."""
     base = RUNS[name]
     return TrainConfig(
-        name=f"unghost-{name}", objective=base.objective, network=base.network, seed=options.seed,
-        steps=options.steps or ENDLESS, max_seconds=options.minutes * 60.0 if options.minutes else None,
-        batch_size=options.batch_size or base.batch_size, learning_rate=base.learning_rate,
-        device=options.device, threads=options.threads, precision=options.precision,
-    )  # fmt: skip
+        name=f"unghost-{name}",
+        objective=base.objective,
+        network=base.network,
+        seed=options.seed,
+        steps=options.steps or ENDLESS,
+        max_seconds=options.minutes * 60.0 if options.minutes else None,
+        batch_size=options.batch_size or base.batch_size,
+        learning_rate=base.learning_rate,
+        device=options.device,
+        threads=options.threads,
+        precision=options.precision,
+    )
 
 
 def run(name: str, options: argparse.Namespace) -> str:
     """Train one; a line that says how its loss went."""
     losses: list[float] = []
     result = train(
-        configured(name, options), train_shards=[pair for spec in options.shards for pair in expand_shards(spec)],
-        validation_shards=dict(spec.split("=", 1) for spec in options.validation), out=options.out / name,
-        resume=options.resume, on_step=lambda step, values: losses.append(values["loss"]),
-    )  # fmt: skip
+        configured(name, options),
+        train_shards=[pair for spec in options.shards for pair in expand_shards(spec)],
+        validation_shards=dict(spec.split("=", 1) for spec in options.validation),
+        out=options.out / name,
+        resume=options.resume,
+        on_step=lambda step, values: losses.append(values["loss"]),
+    )
     part = max(1, len(losses) // 5)
     first, last = (sum(values) / part for values in (losses[:part], losses[-part:]))
     return f"{name}: {result.steps} steps in {result.seconds:.0f} s, loss {first:.4f} -> {last:.4f}, {result.model}"

@@ -91,10 +91,14 @@ def row_of(size: str, channels: Sequence[str], options: Options) -> dict[str, An
     with closing(mixture.stream(0, options.batch_size)) as stream:
         both = per_second(lambda: trainer.learn(next(stream)), options)
     row = {
-        "method": size, "channels": list(channels), "loader_cubes_per_second": loader,
-        "network_cubes_per_second": alone, "training_cubes_per_second": both, "loader_over_network": loader / alone,
+        "method": size,
+        "channels": list(channels),
+        "loader_cubes_per_second": loader,
+        "network_cubes_per_second": alone,
+        "training_cubes_per_second": both,
+        "loader_over_network": loader / alone,
         "precision": "bf16" if trainer.bf16 else "fp32",
-    }  # fmt: skip
+    }
     say(f"{size:2s} {len(channels)} channels: loader {loader:.0f}, network {alone:.0f}, together {both:.0f} cubes/s")
     return row
 

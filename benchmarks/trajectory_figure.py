@@ -11,9 +11,18 @@ import numpy as np
 from trajectory_tables import COLORS, REFERENCE, Cell, finished, main_rows, score_at
 
 DRAWN = (
-    "field", "visibility", "visibility+tv", "visibility+distortion", "bayes-rays", "clean", "photo-doubt",
-    "dsds-restoration", "dsds-restoration+tv", "dsds-restoration+distortion", "dsds-once+tv",
-)  # fmt: skip
+    "field",
+    "visibility",
+    "visibility+tv",
+    "visibility+distortion",
+    "bayes-rays",
+    "clean",
+    "photo-doubt",
+    "dsds-restoration",
+    "dsds-restoration+tv",
+    "dsds-restoration+distortion",
+    "dsds-once+tv",
+)
 OTHERS = "#d0d0d0"
 ROWS = {"own": "each cut in its own order of pixels", "photos": "all cut by photo doubt"}
 COLUMNS = {"psnr": "PSNR, dB (higher is better)", "disparity_mae": "disparity error (lower is better)"}

@@ -116,8 +116,10 @@ def render(outcome: Outcome, scene: TrajectoryScene, cameras: Cameras, *, values
     """``rgb (n, H, W, 3)``, ``depth``, ``accumulation``, ``spread``; with ``values``, the method's ``uncertainty``."""
 
     asked = outcome.uncertainty if values else None
-    views = [render_view(outcome.field, cameras, index, sampling=scene.sampling, values=asked)
-             for index in range(len(cameras))]  # fmt: skip
+    views = [
+        render_view(outcome.field, cameras, index, sampling=scene.sampling, values=asked)
+        for index in range(len(cameras))
+    ]
     stacked = {key: np.stack([view[key] for view in views]) for key in views[0]}
     if asked is not None:
         through = 1.0 - stacked["accumulation"]
@@ -131,15 +133,23 @@ def make_regularizer(
     used = denoiser or load_denoiser("default", backend="onnx", threads=job.threads)
     over = {"cubes": job.cubes, "visibility_reach": REACH, "seed": job.seed, **over}
     return DensityRegularizer(
-        used, aabb=job.base.aabb, cameras=job.scene.train.cameras, field_pitch=job.base.field_pitch,
-        settings=settings, **over,
-    )  # fmt: skip
+        used,
+        aabb=job.base.aabb,
+        cameras=job.scene.train.cameras,
+        field_pitch=job.base.field_pitch,
+        settings=settings,
+        **over,
+    )
 
 
 def fine_tuned(
-    job: Job, make: Callable[[Job], Any] | None = None, *terms: Term, config: TrainingConfig | None = None,
-    note: str = "", observed: bool = True,
-) -> Outcome:  # fmt: skip
+    job: Job,
+    make: Callable[[Job], Any] | None = None,
+    *terms: Term,
+    config: TrainingConfig | None = None,
+    note: str = "",
+    observed: bool = True,
+) -> Outcome:
     """A copy of the field after more training with a regularizer's losses and further terms.
 
     ``make``: of the regularizer, whose making is timed, too. ``observed``: it learns of the rays' densities, if it has
@@ -156,10 +166,16 @@ def fine_tuned(
     left = None if job.seconds is None else max(job.seconds - clock.read()["seconds"], 1e-3)
     budget: dict[str, Any] = {"steps": job.steps} if left is None else {"seconds": left}
     record = train_field(
-        tuned, job.scene.train.cameras, job.scene.train.photos, seed=job.seed, config=config or job.fitting,
-        fine_tune=True, observer=watched,
-        regularizer=(lambda field, step: sum(part(field, step) for part in parts)) if parts else None, **budget,
-    )  # fmt: skip
+        tuned,
+        job.scene.train.cameras,
+        job.scene.train.photos,
+        seed=job.seed,
+        config=config or job.fitting,
+        fine_tune=True,
+        observer=watched,
+        regularizer=(lambda field, step: sum(part(field, step) for part in parts)) if parts else None,
+        **budget,
+    )
     return Outcome(tuned, **clock.read(), steps=record["steps"], note=note)
 
 

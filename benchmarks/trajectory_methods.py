@@ -99,8 +99,10 @@ def paper_timestep(step: int) -> int:
 def paper(job: Job, **over: Any) -> list[Outcome]:
     denoiser = load_denoiser(str(PAPER_PRIOR), backend="onnx", threads=job.threads)
     settings = RegularizerSettings.paper(timestep=paper_timestep, dsds_weight=job.weights.dsds_paper, **over)
-    note = (f"the paper's loss, schedule and objective, and its kind of cubes; {job.cubes} of them a step, as for ours "
-            "(the paper: 40); a network of .29 M parameters (7.2 M need a GPU to train)")  # fmt: skip
+    note = (
+        f"the paper's loss, schedule and objective, and its kind of cubes; {job.cubes} of them a step, as for ours "
+        "(the paper: 40); a network of .29 M parameters (7.2 M need a GPU to train)"
+    )
     return [fine_tuned(job, lambda job: make_regularizer(job, denoiser=denoiser, settings=settings), note=note)]
 
 
@@ -109,18 +111,26 @@ def bayes_rays(job: Job, base: Any) -> list[Outcome]:
     clock = Clock()
     told = job.scene.train
     found = deformation_uncertainty(
-        base, told.cameras, told.photos, seed=job.seed, sampling=job.scene.sampling, level=7,
+        base,
+        told.cameras,
+        told.photos,
+        seed=job.seed,
+        sampling=job.scene.sampling,
+        level=7,
         rays=min(UNCERTAINTY_RAYS, told.photos[..., 0].size),
-    )  # fmt: skip
+    )
     took = clock.read()
     mine = job.weights.bayes_rays
     return [
         Outcome(
-            FilteredField(base, found.keep(threshold)), **took, knob=threshold, uncertainty=found.log_deviation,
+            FilteredField(base, found.keep(threshold)),
+            **took,
+            knob=threshold,
+            uncertainty=found.log_deviation,
             background_uncertainty=LOWEST,
         )
         for threshold in (mine, *(each for each in UNCERTAINTY_THRESHOLDS if each != mine))
-    ]  # fmt: skip
+    ]
 
 
 def _visibility_and_bayes_rays(job: Job) -> list[Outcome]:
@@ -152,8 +162,9 @@ def cleaned(job: Job, base: Any, *, strengths: tuple[float, ...] = STRENGTHS) ->
     judgement = judged(job, base)
     masks = {strength: judgement.mask(strength) for strength in strengths}
     took = clock.read()
-    return [_doubted(Outcome(FilteredField(base, mask.keep), **took, knob=strength))
-            for strength, mask in masks.items()]  # fmt: skip
+    return [
+        _doubted(Outcome(FilteredField(base, mask.keep), **took, knob=strength)) for strength, mask in masks.items()
+    ]
 
 
 def once(job: Job, name: str) -> Outcome:
@@ -199,8 +210,12 @@ METHODS: dict[str, Callable[[Job], list[Outcome]]] = {
 }
 FACTOR_OF = {
     **{f"visibility+{name}": name for name in ("sparsity", "tv", "regnerf", "distortion")},
-    "free-space": "free_space", "bayes-rays": "bayes_rays", "visibility+bayes-rays": "bayes_rays",
-    "dsds-paper": "dsds_paper", "dsds-restoration+distortion": "distortion", "dsds-restoration+tv": "tv",
+    "free-space": "free_space",
+    "bayes-rays": "bayes_rays",
+    "visibility+bayes-rays": "bayes_rays",
+    "dsds-paper": "dsds_paper",
+    "dsds-restoration+distortion": "distortion",
+    "dsds-restoration+tv": "tv",
     "dsds-once+tv": "tv",
-}  # fmt: skip
+}
 UNTRAINED = ("fitted", "photo-doubt", "bayes-rays", "components", "clean")  # equal seconds say nothing of them

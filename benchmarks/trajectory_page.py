@@ -21,9 +21,16 @@ from unghost.evaluation.report import convention_rows
 
 ROOT = Path(__file__).resolve().parents[1]
 OURS = (
-    "photo-doubt", "dsds-restoration", "dsds-restoration+distortion", "dsds-restoration+tv", "dsds-once",
-    "dsds-once+tv", "clean", "visibility+clean", "dsds-restoration+clean",
-)  # fmt: skip
+    "photo-doubt",
+    "dsds-restoration",
+    "dsds-restoration+distortion",
+    "dsds-restoration+tv",
+    "dsds-once",
+    "dsds-once+tv",
+    "clean",
+    "visibility+clean",
+    "dsds-restoration+clean",
+)
 NOTHING_OF_OURS = "photo-doubt"  # but the order of pixels: where all have the same, it is the field as it was fitted
 WATCHED = ("dsds-restoration", "clean")
 ENOUGH = 6  # scenes
@@ -140,59 +147,141 @@ def page(results: dict[str, Any], folder: Path) -> str:
     main = [cell for cell in cells if cell["table"] == "main"]
     scenes = list(dict.fromkeys(cell["scene"] for cell in main))
     text = [
-        "# Who takes ghosts out?", "",
+        "# Who takes ghosts out?",
+        "",
         f"A field is fitted to one sweep of photos and scored on another: {len(scenes)} scenes "
         f"({', '.join(scenes)}); all that trains does so for equally many steps. Synthetic scenes have exact depth, "
         "normals and visibility, and of most places in them it is known whether they are surface or air; of a capture "
         "nothing is known but the photos, and a field fitted to both sweeps stands for the rest, as in the paper. The "
         "scores' convention is `proper` ([what that is](../evaluation.md)); means are over scenes, of each scene over "
-        "its seeds.", "",
+        "its seeds.",
+        "",
         "**Equal coverage.** Whoever removes more is scored on easier pixels. So every method is cut to the lowest "
         "coverage among all of them on that scene, giving up first the pixels of which it is least sure: `bayes-rays` "
         "by its own uncertainty; ours by how far the training photos contradict the pixel (`photo_doubt`) and by how "
         "far the disparity along the ray spreads; whoever has no such thing by how far the depth spreads. All kept "
         "pixels of a scene count alike. **Mean over equal coverages**: the same at every coverage from .1 up to that "
-        "lowest one (`…_area`), for a viewer who would rather see less and trust it.", "",
+        "lowest one (`…_area`), for a viewer who would rather see less and trust it.",
+        "",
         "`photo_doubt` asks for nothing but renders and the photos, so anybody may cut by it. What a method is worth "
-        "beside its order is said by the scores where *all* are cut by photo doubt.", "",
-        "## In plain words", "", *who_wins(results), "",
-        "\"Within chance\": the 95 % interval of the difference over the scenes (Student's t) holds 0. Each side "
+        "beside its order is said by the scores where *all* are cut by photo doubt.",
+        "",
+        "## In plain words",
+        "",
+        *who_wins(results),
+        "",
+        '"Within chance": the 95 % interval of the difference over the scenes (Student\'s t) holds 0. Each side '
         "sends its best of several for each score, which flatters both. Angles of normals get no verdict: between "
         "neighbouring pixels of renders this small the depth is noise, as the row of "
-        f"`{REFERENCE}` shows.", "",
-        "What the rows are:", "", *(f"- `{name}`: {said}." for name, said in ROWS.items()), "",
-        *picture_lines(folder), *scene_lines(results, main), "",
-        "## At equal coverage", "",
-        format_rows(rows, ("at_coverage", "psnr_at_coverage", "ssim_at_coverage", "disparity_mae_at_coverage",
-                           "normal_mean_deg_at_coverage", "psnr_area", "ssim_area", "disparity_mae_area")), "",
-        "![score over coverage](two_trajectory.png)", "",
-        "## How much of that is the order in which pixels are given up?", "",
-        "The same renders, cut in each method's own order, all by the spread of the depth, all by what the photos "
-        "say.", "",
-        format_rows(rows, tuple(f"psnr_at_coverage{order}" for order in CUTS)
-                    + tuple(f"{key}_area{order}" for key in ("psnr", "disparity_mae") for order in CUTS)), "",
-        "## As the paper's table has it, each method at its own coverage", "",
-        format_rows(rows, ("psnr", "ssim", "flip", "depth_mse", "disparity_mae", "normal_mean_deg", "normal_median_deg",
-                           "normal_pct_30", "coverage", "psnr_visible", "seconds", "cpu_seconds")), "",
+        f"`{REFERENCE}` shows.",
+        "",
+        "What the rows are:",
+        "",
+        *(f"- `{name}`: {said}." for name, said in ROWS.items()),
+        "",
+        *picture_lines(folder),
+        *scene_lines(results, main),
+        "",
+        "## At equal coverage",
+        "",
+        format_rows(
+            rows,
+            (
+                "at_coverage",
+                "psnr_at_coverage",
+                "ssim_at_coverage",
+                "disparity_mae_at_coverage",
+                "normal_mean_deg_at_coverage",
+                "psnr_area",
+                "ssim_area",
+                "disparity_mae_area",
+            ),
+        ),
+        "",
+        "![score over coverage](two_trajectory.png)",
+        "",
+        "## How much of that is the order in which pixels are given up?",
+        "",
+        "The same renders, cut in each method's own order, all by the spread of the depth, all by what the photos say.",
+        "",
+        format_rows(
+            rows,
+            tuple(f"psnr_at_coverage{order}" for order in CUTS)
+            + tuple(f"{key}_area{order}" for key in ("psnr", "disparity_mae") for order in CUTS),
+        ),
+        "",
+        "## As the paper's table has it, each method at its own coverage",
+        "",
+        format_rows(
+            rows,
+            (
+                "psnr",
+                "ssim",
+                "flip",
+                "depth_mse",
+                "disparity_mae",
+                "normal_mean_deg",
+                "normal_median_deg",
+                "normal_pct_30",
+                "coverage",
+                "psnr_visible",
+                "seconds",
+                "cpu_seconds",
+            ),
+        ),
+        "",
         f"`seconds` by the clock with {results['threads']} thread{'s' * (results['threads'] > 1)} of two cores, "
         "`cpu_seconds` of all threads together; ours with the photo doubt of the scored views. "
         "`psnr_visible` is over all pixels that a training photo saw, whatever is rendered there: nothing is won by "
-        "removing. LPIPS needs weights that were not to be had; FLIP is the perceptual measure without any.", "",
-        "## What is known of every place (synthetic scenes)", "",
-        format_rows(rows, ("floater_recall", "surface_kept", "holes_filled", "free_space_error", "ause",
-                           "ause_by_spread", "ause_by_photos")), "",
+        "removing. LPIPS needs weights that were not to be had; FLIP is the perceptual measure without any.",
+        "",
+        "## What is known of every place (synthetic scenes)",
+        "",
+        format_rows(
+            rows,
+            (
+                "floater_recall",
+                "surface_kept",
+                "holes_filled",
+                "free_space_error",
+                "ause",
+                "ause_by_spread",
+                "ause_by_photos",
+            ),
+        ),
+        "",
         "`floater_recall`: of what was opaque in the air, no longer opaque. `ause`: how badly an order of pixels (the "
-        "method's own, by spread, by photos) ranks depth errors among those that it is scored on; 0 is perfect.", "",
-        *knob_lines(main), *convention_lines(main),
-    ]  # fmt: skip
+        "method's own, by spread, by photos) ranks depth errors among those that it is scored on; 0 is perfect.",
+        "",
+        *knob_lines(main),
+        *convention_lines(main),
+    ]
     for table, heading in OTHER_TABLES.items():
         if other := main_rows(results, table):
             named = ", ".join(other[0]["scenes"])
-            text += [f"## {heading}", "", f"{named}; seed 0.", "",
-                     format_rows(other, ("psnr", "ssim", "disparity_mae", "coverage", "psnr_at_coverage_by_spread",
-                                         "psnr_at_coverage_by_photos", "psnr_area_by_photos",
-                                         "disparity_mae_area_by_photos", "floater_recall", "surface_kept",
-                                         "seconds")), ""]  # fmt: skip
+            text += [
+                f"## {heading}",
+                "",
+                f"{named}; seed 0.",
+                "",
+                format_rows(
+                    other,
+                    (
+                        "psnr",
+                        "ssim",
+                        "disparity_mae",
+                        "coverage",
+                        "psnr_at_coverage_by_spread",
+                        "psnr_at_coverage_by_photos",
+                        "psnr_area_by_photos",
+                        "disparity_mae_area_by_photos",
+                        "floater_recall",
+                        "surface_kept",
+                        "seconds",
+                    ),
+                ),
+                "",
+            ]
     return "\n".join(text + notes(rows) + provenance(results))
 
 
@@ -203,20 +292,37 @@ def knob_lines(main: list[Row]) -> list[str]:
     rows = [row for row in summary_rows(first) if row["coverage"] is not None]
     turned = {row["method"].split(" @ ")[0] for row in rows if "@" in row["method"]}
     shown = [row for row in rows if row["method"].split(" @ ")[0] in turned]
-    keys = ("psnr", "disparity_mae", "coverage", "floater_recall", "surface_kept", "psnr_at_coverage",
-            "psnr_at_coverage_at_best")  # fmt: skip
-    said = ("Seed 0 of the synthetic scenes. The row without a number stands in the tables. `…_at_best`: with the knob "
-            "and the order that turn out best on each scene, which takes an eye on the truth: nobody can have "
-            "that.")  # fmt: skip
+    keys = (
+        "psnr",
+        "disparity_mae",
+        "coverage",
+        "floater_recall",
+        "surface_kept",
+        "psnr_at_coverage",
+        "psnr_at_coverage_at_best",
+    )
+    said = (
+        "Seed 0 of the synthetic scenes. The row without a number stands in the tables. `…_at_best`: with the knob "
+        "and the order that turn out best on each scene, which takes an eye on the truth: nobody can have "
+        "that."
+    )
     return ["## Knobs", "", said, "", format_rows(shown, keys), ""] if shown else []
 
 
 def provenance(results: dict[str, Any]) -> list[str]:
     """Which commands made the numbers, at which commits."""
     commits = sorted({cell.get("commit", "?")[:7] for cell in results["cells"]})
-    return ["## Where this is from", "", "Written by `python benchmarks/trajectory_page.py` from two_trajectory.json, "
-            f"rows made at the commits {', '.join(commits)} by", "", "```", *results["command"].split(" ; "), "```",
-            ""]  # fmt: skip
+    return [
+        "## Where this is from",
+        "",
+        "Written by `python benchmarks/trajectory_page.py` from two_trajectory.json, "
+        f"rows made at the commits {', '.join(commits)} by",
+        "",
+        "```",
+        *results["command"].split(" ; "),
+        "```",
+        "",
+    ]
 
 
 def scene_lines(results: dict[str, Any], main: list[Row]) -> list[str]:
@@ -233,8 +339,13 @@ def scene_lines(results: dict[str, Any], main: list[Row]) -> list[str]:
         )
     if len(lines) == 2:
         return []
-    return ["## The scenes", "", *lines, "", "Means over the scored photos; all cameras in [-1, 1] (the paper's 0.62, "
-            "28.5°; MipNeRF-360 0.07, 10.5°)."]  # fmt: skip
+    return [
+        "## The scenes",
+        "",
+        *lines,
+        "",
+        "Means over the scored photos; all cameras in [-1, 1] (the paper's 0.62, 28.5°; MipNeRF-360 0.07, 10.5°).",
+    ]
 
 
 def convention_lines(main: list[Row]) -> list[str]:
@@ -255,11 +366,19 @@ def convention_lines(main: list[Row]) -> list[str]:
     scores: dict[str, Row] = {
         name: {"convention": name, **{key: mean(name, key) for key in get_convention(name).keys}} for name in names
     }
-    rows = [{**row, "method": row["metric"]} for row in convention_rows(scores)
-            if any(row[name] is not None for name in names)]  # fmt: skip
-    return ["## The same renders under every published convention", "",
-            f"`field`, mean of {len({scene for scene, _ in known})} scenes; these columns must never be mixed:", "",
-            format_rows(rows, (*names, "spread")).replace("| method |", "| metric |"), ""]  # fmt: skip
+    rows = [
+        {**row, "method": row["metric"]}
+        for row in convention_rows(scores)
+        if any(row[name] is not None for name in names)
+    ]
+    return [
+        "## The same renders under every published convention",
+        "",
+        f"`field`, mean of {len({scene for scene, _ in known})} scenes; these columns must never be mixed:",
+        "",
+        format_rows(rows, (*names, "spread")).replace("| method |", "| metric |"),
+        "",
+    ]
 
 
 def notes(rows: list[Row]) -> list[str]:

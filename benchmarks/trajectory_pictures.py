@@ -79,15 +79,22 @@ def draw_doubt(path: Path, stage: Stage, job: Job, views: list[int]) -> None:
     seen, told = (render(told_by, scene, sweep.cameras) for sweep in (scene.evaluation, scene.train))
     shown = np.clip(seen["rgb"], 0, 1)
     doubt = photo_doubt(
-        shown, seen["depth"], scene.evaluation.cameras, photos=scene.train.photos, photo_depth=told["depth"],
-        photo_cameras=scene.train.cameras, slack=SLACK * job.base.field_pitch,
-    )  # fmt: skip
+        shown,
+        seen["depth"],
+        scene.evaluation.cameras,
+        photos=scene.train.photos,
+        photo_depth=told["depth"],
+        photo_cameras=scene.train.cameras,
+        slack=SLACK * job.base.field_pitch,
+    )
     wrong = np.abs(shown - scene.evaluation.photos).mean(axis=-1)
     columns: dict[str, tuple[Any, float | None]] = {
-        "photo": (scene.evaluation.photos, None), "the field as fitted": (shown, None),
-        "the photos' doubt": (doubt, 0.3), "the prior's doubt": (seen["uncertainty"], 1.0),
+        "photo": (scene.evaluation.photos, None),
+        "the field as fitted": (shown, None),
+        "the photos' doubt": (doubt, 0.3),
+        "the prior's doubt": (seen["uncertainty"], 1.0),
         "what is wrong (colour)": (wrong, 0.3),
-    }  # fmt: skip
+    }
     figure = Figure(figsize=(2.6 * len(columns), 2.05 * len(views) + 0.5), facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.subplots(len(views), len(columns), squeeze=False)
@@ -116,11 +123,14 @@ def main() -> None:
         views = np.unique(np.linspace(0, count - 1, options.views + 2).round().astype(int)[1:-1]).tolist()
         path = options.out / "two_trajectory_views.png"
         draw_comparison(
-            path, columns(options, stage, cache), views=views, limit=stage.scene.extent.limit,
+            path,
+            columns(options, stage, cache),
+            views=views,
+            limit=stage.scene.extent.limit,
             title=f"{stage.scene.name}: trained on one sweep, seen from another",
             note=f"Below each picture its depth (warm is near; grey: nothing within the depth limit). "
             f"Seed {options.seed}, {stage.steps} steps of each method.",
-        )  # fmt: skip
+        )
         say(str(path))
         base, _ = fitted(benchmark, cache, "field", stage.scene, stage.scene.train, options.seed, stage.fit_steps)
         job = Job(stage.scene, base, options.seed, stage.steps, threads=options.threads)

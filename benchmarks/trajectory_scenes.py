@@ -46,8 +46,10 @@ class Sweep:
     def joined(self, other: Sweep) -> Sweep:
         """Both sweeps."""
         first, second = self.cameras, other.cameras
-        parts = [np.concatenate([getattr(first, name), getattr(second, name)])
-                 for name in ("camera_to_world", "intrinsics", "distortion")]  # fmt: skip
+        parts = [
+            np.concatenate([getattr(first, name), getattr(second, name)])
+            for name in ("camera_to_world", "intrinsics", "distortion")
+        ]
         cameras = Cameras.create(parts[0], parts[1], first.width, first.height, parts[2])
         return Sweep(cameras, np.concatenate([self.photos, other.photos]))
 
@@ -111,10 +113,12 @@ class TrajectoryScene:
 def _selected(photographed: PhotographedScene, chosen: NDArray[Any]) -> PhotographedScene:
     """Some of the photos."""
     return dataclasses.replace(
-        photographed, cameras=photographed.cameras.select(chosen),
+        photographed,
+        cameras=photographed.cameras.select(chosen),
         true_cameras=photographed.true_cameras.select(chosen),
-        images=photographed.images[chosen], depth_maps=photographed.depth_maps[chosen],
-    )  # fmt: skip
+        images=photographed.images[chosen],
+        depth_maps=photographed.depth_maps[chosen],
+    )
 
 
 class LabelledSpace:
@@ -187,9 +191,15 @@ def synthetic_scene(
     samples = max(48, round(2.4 * (resolution - 1) / 4))
     sampling = Sampling(near_samples=samples, far_samples=max(12, samples // 4))
     scene = TrajectoryScene(
-        name, Sweep(first.cameras, first.images), Sweep(again.cameras, again.images), resolution, sampling, 1152, first,
+        name,
+        Sweep(first.cameras, first.images),
+        Sweep(again.cameras, again.images),
+        resolution,
+        sampling,
+        1152,
+        first,
         again,
-    )  # fmt: skip
+    )
     seen = float(scene.pseudo(lambda cameras: np.zeros(0)).visible(occlusion=True).mean())
     if seen < FEWEST_SEEN:
         raise ValueError(f"synthetic_scene: {seen:.2f} of {name}'s second sweep was seen by its first, too little")
@@ -199,8 +209,10 @@ def synthetic_scene(
 def captured_scene(folder: Path, train: str, evaluation: str, *, downscale: float) -> TrajectoryScene:
     """A real capture."""
     capture = load_capture(folder, downscale=downscale)
-    sweeps = [Sweep(capture.cameras.select(chosen), capture.images(chosen))
-              for chosen in (capture.split(train), capture.split(evaluation))]  # fmt: skip
+    sweeps = [
+        Sweep(capture.cameras.select(chosen), capture.images(chosen))
+        for chosen in (capture.split(train), capture.split(evaluation))
+    ]
     if set(capture.split(train)) & set(capture.split(evaluation)):
         raise ValueError(f"{train} and {evaluation} share photos")
     name = f"{folder.resolve().name} {train} to {evaluation} at 1:{downscale:g}"

@@ -90,10 +90,14 @@ def _doubts(stage: Stage, outcome: Outcome, views: Views, renders: Renders, head
     if headline or outcome.asks_photos:
         told = stage.scene.train
         found["photos"] = photo_doubt(
-            renders.colours, views["depth"], stage.scene.evaluation.cameras, photos=told.photos,
-            photo_depth=render(outcome, stage.scene, told.cameras, values=False)["depth"], photo_cameras=told.cameras,
+            renders.colours,
+            views["depth"],
+            stage.scene.evaluation.cameras,
+            photos=told.photos,
+            photo_depth=render(outcome, stage.scene, told.cameras, values=False)["depth"],
+            photo_cameras=told.cameras,
             slack=SLACK * outcome.field.field_pitch,
-        )  # fmt: skip
+        )
     if outcome.asks_photos:
         found["own"] = found["photos"] * np.sqrt(views["spread"] / views["depth"] + LEAST_SPREAD)
     return found

@@ -35,10 +35,14 @@ from unghost.evaluation.protocol import json_ready
 
 ROOT = Path(__file__).resolve().parents[1]
 FACTORS = {
-    "sparsity": (1e-4, 1e-3, 1e-2, 1e-1), "tv": (1e-3, 1e-2, 1e-1, 1.0), "regnerf": (1e-3, 1e-2, 1e-1, 1.0),
-    "distortion": (4e-3, 2e-2, 1e-1, 5e-1), "free_space": (1e-6, 1e-5, 1e-4, 1e-3), "bayes_rays": (0.6, 0.7, 0.8, 0.9),
+    "sparsity": (1e-4, 1e-3, 1e-2, 1e-1),
+    "tv": (1e-3, 1e-2, 1e-1, 1.0),
+    "regnerf": (1e-3, 1e-2, 1e-1, 1.0),
+    "distortion": (4e-3, 2e-2, 1e-1, 5e-1),
+    "free_space": (1e-6, 1e-5, 1e-4, 1e-3),
+    "bayes_rays": (0.6, 0.7, 0.8, 0.9),
     "dsds_paper": (1e-2, 1e-1, 1.0, 10.0),
-}  # fmt: skip
+}
 WITHIN_DB = 0.1
 
 
@@ -74,9 +78,14 @@ def chosen_factors(rows: list[dict[str, Any]]) -> dict[str, str]:
         most = max(row["psnr_at_coverage"] for row in mine)
         good = [row for row in mine if row["psnr_at_coverage"] >= most - WITHIN_DB]
         there = f"{loss} {getattr(Weights(), loss):g}"
-        result[loss] = min(good, key=lambda row: (round(row["disparity_mae_at_coverage"], 3),
-                                                  -round(row["psnr_at_coverage"], 2), row["method"] != there)
-                           )["method"]  # fmt: skip
+        result[loss] = min(
+            good,
+            key=lambda row: (
+                round(row["disparity_mae_at_coverage"], 3),
+                -round(row["psnr_at_coverage"], 2),
+                row["method"] != there,
+            ),
+        )["method"]
     return result
 
 
@@ -96,8 +105,10 @@ def main() -> None:
                 job = Job(scene, base, 0, options.steps, threads=options.threads, weights=weights)
                 row = scored(stage, method(job)[0], None, headline=False)
                 cells.append({"table": loss, "scene": name, "seed": 0, "method": f"{factor:g}", **row})
-                say(f"{name} {loss} {factor:g}: psnr {row['psnr']:.2f} coverage {row['coverage']:.3f} "
-                    f"disparity {row['disparity_mae']:.3f}")  # fmt: skip
+                say(
+                    f"{name} {loss} {factor:g}: psnr {row['psnr']:.2f} coverage {row['coverage']:.3f} "
+                    f"disparity {row['disparity_mae']:.3f}"
+                )
     path = options.out / "two_trajectory_sweep.json"
     stored = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"rows": []}
     rows = [{**row, "method": f"{row['table']} {row['method']}"} for row in summary_rows(cells)]
@@ -105,8 +116,10 @@ def main() -> None:
     best = chosen_factors(rows)
     for row in rows:
         row["chosen"] = best[row["table"]] == row["method"]
-        say(f"{row['method']}: {row['psnr_at_coverage']:.3f} dB at {row['at_coverage']:.3f}, disparity "
-            f"{row['disparity_mae_at_coverage']:.4f}{' *' * row['chosen']}")  # fmt: skip
+        say(
+            f"{row['method']}: {row['psnr_at_coverage']:.3f} dB at {row['at_coverage']:.3f}, disparity "
+            f"{row['disparity_mae_at_coverage']:.4f}{' *' * row['chosen']}"
+        )
     command = f"python benchmarks/trajectory_sweep.py --scenes {' '.join(options.scenes)}"
     named = " ".join(options.losses)
     if options.losses != tuple(FACTORS):

@@ -18,10 +18,27 @@ from unghost.evaluation.curves import Curve
 from unghost.evaluation.intervals import bootstrap_scenes
 
 KEYS = (
-    "psnr", "ssim", "flip", "depth_mse", "disparity_mae", "normal_mean_deg", "normal_median_deg", "normal_pct_30",
-    "coverage", "images_scored", "psnr_visible", "ause", "ause_by_spread", "ause_by_photos", "floater_recall",
-    "surface_kept", "holes_filled", "free_space_error", "seconds", "cpu_seconds",
-)  # fmt: skip
+    "psnr",
+    "ssim",
+    "flip",
+    "depth_mse",
+    "disparity_mae",
+    "normal_mean_deg",
+    "normal_median_deg",
+    "normal_pct_30",
+    "coverage",
+    "images_scored",
+    "psnr_visible",
+    "ause",
+    "ause_by_spread",
+    "ause_by_photos",
+    "floater_recall",
+    "surface_kept",
+    "holes_filled",
+    "free_space_error",
+    "seconds",
+    "cpu_seconds",
+)
 SECONDS = ("seconds", "cpu_seconds")  # of rows with the most threads
 AT_EQUAL = ("psnr", "ssim", "disparity_mae", "normal_mean_deg")
 LOWER_IS_BETTER = ("disparity_mae", "normal_mean_deg")
@@ -31,14 +48,29 @@ ORDERS = {"": "own", "_by_spread": "spread", "_by_photos": "photos", "_at_best":
 REFERENCE = "pseudo-gt"
 FEWER_SEEDS = (REFERENCE,)
 COLORS = {  # in the order of the tables
-    "pseudo-gt": "#bbbbbb", "fitted": "#888888", "field": "#444444", "visibility": "#1f77b4",
-    "visibility+sparsity": "#9ecae1", "visibility+tv": "#17becf", "visibility+regnerf": "#74c476",
-    "visibility+distortion": "#9467bd", "free-space": "#e7ba52", "bayes-rays": "#2ca02c",
-    "visibility+bayes-rays": "#98df8a", "components": "#8c564b", "dsds-paper": "#f7b6d2", "photo-doubt": "#bc80bd",
-    "dsds-restoration": "#d62728", "dsds-restoration+distortion": "#8b0000", "dsds-restoration+tv": "#e377c2",
-    "dsds-once": "#b15928", "dsds-once+tv": "#6a3d9a",
-    "clean": "#ff7f0e", "visibility+clean": "#ffbb78", "dsds-restoration+clean": "#ff9896",
-}  # fmt: skip
+    "pseudo-gt": "#bbbbbb",
+    "fitted": "#888888",
+    "field": "#444444",
+    "visibility": "#1f77b4",
+    "visibility+sparsity": "#9ecae1",
+    "visibility+tv": "#17becf",
+    "visibility+regnerf": "#74c476",
+    "visibility+distortion": "#9467bd",
+    "free-space": "#e7ba52",
+    "bayes-rays": "#2ca02c",
+    "visibility+bayes-rays": "#98df8a",
+    "components": "#8c564b",
+    "dsds-paper": "#f7b6d2",
+    "photo-doubt": "#bc80bd",
+    "dsds-restoration": "#d62728",
+    "dsds-restoration+distortion": "#8b0000",
+    "dsds-restoration+tv": "#e377c2",
+    "dsds-once": "#b15928",
+    "dsds-once+tv": "#6a3d9a",
+    "clean": "#ff7f0e",
+    "visibility+clean": "#ffbb78",
+    "dsds-restoration+clean": "#ff9896",
+}
 Cell = dict[str, Any]
 
 
@@ -53,9 +85,13 @@ def summary_rows(cells: Sequence[Cell]) -> list[dict[str, Any]]:
     for table, method in sorted(dict.fromkeys((cell["table"], cell["method"]) for cell in cells), key=_place):
         mine = [cell for cell in cells if (cell["table"], cell["method"]) == (table, method)]
         row: dict[str, Any] = {
-            "method": method, "table": table, "convention": mine[0]["convention"],
-            "scenes": sorted({cell["scene"] for cell in mine}), "runs": len(mine), "note": mine[-1].get("note", ""),
-        }  # fmt: skip
+            "method": method,
+            "table": table,
+            "convention": mine[0]["convention"],
+            "scenes": sorted({cell["scene"] for cell in mine}),
+            "runs": len(mine),
+            "note": mine[-1].get("note", ""),
+        }
         intervals = {}
         most = max(cell.get("threads", 0) for cell in mine)
         for key in KEYS:
@@ -116,8 +152,11 @@ def _curve(cell: Cell, order: str, key: str) -> Curve | None:
     """Cut in one order of pixels; None where there is no score."""
     columns = cell.get("curves", {}).get(order, {})
     points = zip(columns.get("coverage", ()), columns.get(key, ()))
-    rows = [{"coverage": coverage, key: value, "convention": cell["convention"]}
-            for coverage, value in points if value is not None]  # fmt: skip
+    rows = [
+        {"coverage": coverage, key: value, "convention": cell["convention"]}
+        for coverage, value in points
+        if value is not None
+    ]
     if not rows:
         return None
     return Curve.create(cell["method"], rows, metric=key, higher_is_better=key not in LOWER_IS_BETTER)
@@ -127,8 +166,9 @@ def score_at(cells: Sequence[Cell], cell: Cell, key: str, coverage: float, order
     """A method's score at a coverage on one run; ``order`` None: at its best setting, in the order best for it."""
     same, orders = [cell], [order]
     if order is None:
-        same += [other for other in cells if _run(other) == _run(cell)
-                 and other["method"].startswith(f"{cell['method']} @ ")]  # fmt: skip
+        same += [
+            other for other in cells if _run(other) == _run(cell) and other["method"].startswith(f"{cell['method']} @ ")
+        ]
         orders = ["own", "spread", "photos"]
     curves = [_curve(each, name, key) for each in same for name in orders if name is not None]
     found = [value for value in (curve.at(coverage) for curve in curves if curve is not None) if value is not None]
@@ -153,8 +193,10 @@ def _at_equal_coverage(cells: Sequence[Cell]) -> dict[tuple[Any, str], dict[str,
         for cell in mine:
             found: dict[str, float | None] = {
                 f"{key}_at_coverage{name}": score_at(mine, cell, key, lowest, order)
-                for key in AT_EQUAL for name, order in ORDERS.items() if order is not None or turned
-            }  # fmt: skip
+                for key in AT_EQUAL
+                for name, order in ORDERS.items()
+                if order is not None or turned
+            }
             for key in AT_EQUAL:
                 for name, order in ORDERS.items():
                     curve = None if order is None or lowest <= FROM else _curve(cell, order, key)

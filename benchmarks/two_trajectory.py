@@ -153,9 +153,12 @@ class Ledger:
         named = {"table": self.options.table(), "scene": stage.scene.name, "seed": seed, "method": method}
         swept = FACTOR_OF.get("dsds-paper" if method.startswith("paper, ") else method)
         return {
-            **named, "factor": getattr(Weights(), swept) if swept else None, "steps": stage.steps,
-            "fit_steps": stage.fit_steps, "scene_seed": self.options.scene_seed,
-        }  # fmt: skip
+            **named,
+            "factor": getattr(Weights(), swept) if swept else None,
+            "steps": stage.steps,
+            "fit_steps": stage.fit_steps,
+            "scene_seed": self.options.scene_seed,
+        }
 
     def has(self, key: dict[str, Any]) -> bool:
         """Whether that row is finished."""
@@ -164,11 +167,16 @@ class Ledger:
     def seconds_of(self, scene: str, method: str) -> float:
         """What a method of the main table took there with as many threads, the median over seeds."""
         wanted = ("main", scene, method, self.options.threads)
-        took = [float(cell["seconds"]) for cell in self.cells
-                if (cell["table"], cell["scene"], cell["method"], cell.get("threads")) == wanted]  # fmt: skip
+        took = [
+            float(cell["seconds"])
+            for cell in self.cells
+            if (cell["table"], cell["scene"], cell["method"], cell.get("threads")) == wanted
+        ]
         if not took:
-            raise ValueError(f"two_trajectory: equal seconds are those of {method}, threads {self.options.threads}: "
-                             f"do the main table of {scene} first")  # fmt: skip
+            raise ValueError(
+                f"two_trajectory: equal seconds are those of {method}, threads {self.options.threads}: "
+                f"do the main table of {scene} first"
+            )
         return float(np.median(took))
 
     def describe(self, stage: Stage) -> None:
@@ -193,14 +201,21 @@ class Ledger:
         self.commands = [*(each for each in self.commands if each != command), command]
         seeds = sorted({cell["seed"] for cell in self.cells})
         results = build_results(
-            summary_rows(self.cells), command=" ; ".join(self.commands), seeds=seeds, convention=CONVENTION,
-            scene_seed=self.options.scene_seed, threads=self.options.threads, scenes=self.scenes, cells=self.cells,
-        )  # fmt: skip
+            summary_rows(self.cells),
+            command=" ; ".join(self.commands),
+            seeds=seeds,
+            convention=CONVENTION,
+            scene_seed=self.options.scene_seed,
+            threads=self.options.threads,
+            scenes=self.scenes,
+            cells=self.cells,
+        )
         write_results(self.path, json_ready(results))
 
 
-def fitted(options: Options, cache: FitCache, stage_name: str, scene: TrajectoryScene, sweep: Sweep, seed: int,
-           steps: int) -> tuple[RadianceField, float]:  # fmt: skip
+def fitted(
+    options: Options, cache: FitCache, stage_name: str, scene: TrajectoryScene, sweep: Sweep, seed: int, steps: int
+) -> tuple[RadianceField, float]:
     """A field of a sweep, and the seconds its fit took."""
     config = RadianceConfig(scene.resolution, max(48, scene.resolution * 4 // 5))
     key = {"photos": sweep.digest(), "seed": seed, "steps": steps, "rays": scene.rays}
@@ -271,8 +286,14 @@ def run_stage(options: Options, stage: Stage, cache: FitCache, ledger: Ledger, p
             if seed > 0 or scene.photographed is None:
                 outcomes = outcomes[:1]
             last, *_ = ledger.add(rows_of(keys[name], stage, outcomes, space))
-            say("    " + " ".join(f"{key} {last[key]:.3f}" for key in ("psnr", "disparity_mae", "coverage", "seconds")
-                                  if last.get(key) is not None))  # fmt: skip
+            say(
+                "    "
+                + " ".join(
+                    f"{key} {last[key]:.3f}"
+                    for key in ("psnr", "disparity_mae", "coverage", "seconds")
+                    if last.get(key) is not None
+                )
+            )
 
 
 def main() -> None:

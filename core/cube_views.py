@@ -26,9 +26,14 @@ def frustum_normals(cameras: Cameras) -> NDArray[np.float64]:
         raise ValueError("frustum_normals: cameras must have no distortion")
     fx, fy, cx, cy = cameras.intrinsics.T
     zero = np.zeros_like(fx)
-    local = np.array([
-        [fx, zero, -cx], [-fx, zero, cx - cameras.width], [zero, -fy, -cy], [zero, fy, cy - cameras.height],
-    ])  # fmt: skip
+    local = np.array(
+        [
+            [fx, zero, -cx],
+            [-fx, zero, cx - cameras.width],
+            [zero, -fy, -cy],
+            [zero, fy, cy - cameras.height],
+        ]
+    )
     normals: NDArray[np.float64] = np.einsum("nab,sbn->nsa", cameras.camera_to_world[:, :, :3], local)
     return normals
 

@@ -61,9 +61,14 @@ def build_results(
     if command is None:
         command = " ".join(["python", Path(sys.argv[0]).name, *sys.argv[1:]])
     return {
-        "command": command, "commit": commit(), "versions": versions(), "machine": machine(),
-        "seeds": list(seeds), **extra, "rows": [dict(row) for row in rows],
-    }  # fmt: skip
+        "command": command,
+        "commit": commit(),
+        "versions": versions(),
+        "machine": machine(),
+        "seeds": list(seeds),
+        **extra,
+        "rows": [dict(row) for row in rows],
+    }
 
 
 def write_results(path: str | Path, results: Mapping[str, Any]) -> None:

@@ -152,9 +152,12 @@ def write_shard(folder: str | Path, arrays: Mapping[str, NDArray[Any]], provenan
         for name in layout:
             _save(partial / f"{name}.npy", np.ascontiguousarray(arrays[name]))
         manifest = {
-            "format": FORMAT, "format_version": FORMAT_VERSION, "count": count,
-            "sha256": {name: _sha256(partial / f"{name}.npy") for name in layout}, "provenance": dict(provenance),
-        }  # fmt: skip
+            "format": FORMAT,
+            "format_version": FORMAT_VERSION,
+            "count": count,
+            "sha256": {name: _sha256(partial / f"{name}.npy") for name in layout},
+            "provenance": dict(provenance),
+        }
         (partial / "manifest.json").write_text(json.dumps(manifest, indent=1), encoding="utf-8")
         os.replace(partial, target)
     except BaseException as error:

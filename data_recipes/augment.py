@@ -249,10 +249,19 @@ def salt(rng: np.random.Generator, occupancy: Occupancy, severity: float) -> Occ
 CORRUPTIONS: dict[str, Corruption] = {
     function.__name__: function
     for function in (
-        detached_blobs, touching_floaters, fog_sheets, fog_volumes, holes, rough_surface, swollen_surface,
-        doubled_surface, streaks, blocks, salt,
+        detached_blobs,
+        touching_floaters,
+        fog_sheets,
+        fog_volumes,
+        holes,
+        rough_surface,
+        swollen_surface,
+        doubled_surface,
+        streaks,
+        blocks,
+        salt,
     )
-}  # fmt: skip
+}
 
 
 def corrupt(rng: np.random.Generator, occupancy: Occupancy, severity: float) -> Occupancy:

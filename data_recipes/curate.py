@@ -40,11 +40,16 @@ class _Plan:
         shard = read_shard(self.folder, verify=True)
         there = _flat(shard.provenance | {"count": len(shard), "frames": shard.frames is not None})
         wanted = _flat(self.provenance | {"count": self.stop - self.start, "frames": True})
-        differing = [f"{key}: {there.get(key)!r:.80}, not {value!r:.80}" for key, value in sorted(wanted.items())
-                     if there.get(key) != value]  # fmt: skip
+        differing = [
+            f"{key}: {there.get(key)!r:.80}, not {value!r:.80}"
+            for key, value in sorted(wanted.items())
+            if there.get(key) != value
+        ]
         if differing:
-            raise ValueError(f"curate: {self.folder} holds another curation ({'; '.join(differing)}): "
-                             "choose another out folder or remove it")  # fmt: skip
+            raise ValueError(
+                f"curate: {self.folder} holds another curation ({'; '.join(differing)}): "
+                "choose another out folder or remove it"
+            )
         return shard.provenance
 
     def write(self, chunks: Iterator[Chunk], bar: tqdm[Any]) -> dict[str, Any]:

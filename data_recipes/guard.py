@@ -183,9 +183,13 @@ class MeshGuard:
         arguments = [json.dumps(paths), str(theirs.fileno()), str(self.limits.memory_megabytes)]
         self._process = subprocess.Popen(
             [sys.executable, "-I", "-c", _START, *arguments],
-            pass_fds=(theirs.fileno(),), start_new_session=True, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
-            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-        )  # fmt: skip
+            pass_fds=(theirs.fileno(),),
+            start_new_session=True,
+            env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
         theirs.close()
         self._connection = ours
         self.starts += 1
@@ -202,9 +206,12 @@ class MeshGuard:
     def _send(self, path: Path) -> None:
         assert self._connection is not None
         request = {
-            "path": str(path), "root": str(self.root), "seconds": self._seconds, "cpu": self.limits.cpu_seconds,
+            "path": str(path),
+            "root": str(self.root),
+            "seconds": self._seconds,
+            "cpu": self.limits.cpu_seconds,
             "repair": None if self.repair is None else dataclasses.asdict(self.repair),
-        }  # fmt: skip
+        }
         try:
             self._connection.send_bytes(json.dumps(request).encode())
         except OSError:

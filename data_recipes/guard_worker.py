@@ -23,10 +23,33 @@ from .repair import RepairOptions, repair_triangles
 _GRACE = 5.0  # seconds after the asker's limit at which an orphan ends itself
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 _FORBIDDEN = (
-    "socket.", "urllib.", "http.", "ftplib.", "smtplib.", "subprocess.", "os.system", "os.exec", "os.fork", "os.spawn",
-    "os.posix_spawn", "os.startfile", "pty.", "os.remove", "os.rename", "os.rmdir", "os.mkdir", "os.link", "os.symlink",
-    "os.chmod", "os.chown", "os.truncate", "os.kill", "shutil.", "tempfile.", "webbrowser.",
-)  # fmt: skip
+    "socket.",
+    "urllib.",
+    "http.",
+    "ftplib.",
+    "smtplib.",
+    "subprocess.",
+    "os.system",
+    "os.exec",
+    "os.fork",
+    "os.spawn",
+    "os.posix_spawn",
+    "os.startfile",
+    "pty.",
+    "os.remove",
+    "os.rename",
+    "os.rmdir",
+    "os.mkdir",
+    "os.link",
+    "os.symlink",
+    "os.chmod",
+    "os.chown",
+    "os.truncate",
+    "os.kill",
+    "shutil.",
+    "tempfile.",
+    "webbrowser.",
+)
 
 
 class Fence:
@@ -75,9 +98,12 @@ def repaired(mesh: MeshFile, options: RepairOptions) -> MeshFile:
     """The mesh with its triangles repaired, and normalised anew."""
     triangles, center, extent, dropped = normalise(repair_triangles(mesh.triangles, options=options).triangles)
     return dataclasses.replace(
-        mesh, triangles=triangles, center=mesh.center + mesh.extent * center, extent=mesh.extent * extent,
+        mesh,
+        triangles=triangles,
+        center=mesh.center + mesh.extent * center,
+        extent=mesh.extent * extent,
         dropped=mesh.dropped + dropped,
-    )  # fmt: skip
+    )
 
 
 def answer(path: str, root: str, repair: RepairOptions | None = None) -> tuple[dict[str, Any], MeshFile | None]:
@@ -97,13 +123,20 @@ def answer(path: str, root: str, repair: RepairOptions | None = None) -> tuple[d
     except Exception as error:  # whatever a reader did not foresee costs the file, never the run
         mesh, status, reason = None, "rejected", f"{type(error).__name__}: {str(error)[:200]}"
     record: dict[str, Any] = {
-        "status": status, "reason": reason, "again": again, "seconds": time.perf_counter() - begun,
-    }  # fmt: skip
+        "status": status,
+        "reason": reason,
+        "again": again,
+        "seconds": time.perf_counter() - begun,
+    }
     if mesh is not None:
         record |= {
-            "shape": list(mesh.triangles.shape), "center": mesh.center.tolist(), "extent": mesh.extent,
-            "dropped": mesh.dropped, "sha256": mesh.sha256, "side_files": mesh.side_files,
-        }  # fmt: skip
+            "shape": list(mesh.triangles.shape),
+            "center": mesh.center.tolist(),
+            "extent": mesh.extent,
+            "dropped": mesh.dropped,
+            "sha256": mesh.sha256,
+            "side_files": mesh.side_files,
+        }
     return record, mesh
 
 

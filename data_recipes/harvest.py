@@ -114,14 +114,16 @@ def harvest_cubes(
         hidden = full_channel(dequantize_share(light)) < HIDDEN
         labels = truth.labels(lattice, field.field_pitch, opaque, hidden)
         about = surroundings(density_fn, *frames, assumed_pitch[some], field.aabb)
-        parts.append({
-            "inputs": stored,
-            "labels": pack_labels(labels),
-            "severity": severity_of(inputs, labels),
-            "surroundings": quantize_signed(about),
-            "view_count": count_views(truth.cameras, *frames),
-            "transmittance": light,
-        })  # fmt: skip
+        parts.append(
+            {
+                "inputs": stored,
+                "labels": pack_labels(labels),
+                "severity": severity_of(inputs, labels),
+                "surroundings": quantize_signed(about),
+                "view_count": count_views(truth.cameras, *frames),
+                "transmittance": light,
+            }
+        )
     arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     arrays["edge_fraction"] = (edges / scene_extent(field.aabb)).astype(np.float32)
     arrays["frames"] = np.concatenate([centers, edges[:, None], rotations.reshape(count, 9)], axis=1)
@@ -188,16 +190,27 @@ def harvest_scene(
     arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     arrays["group"] = np.full(len(arrays["inputs"]), index, dtype=np.int32)
     check_fit(
-        dequantize_signed(arrays["inputs"]), unpack_labels(arrays["labels"]),
-        fewest_opaque=config.fewest_opaque, most_ghosts=config.most_ghosts,
-    )  # fmt: skip
+        dequantize_signed(arrays["inputs"]),
+        unpack_labels(arrays["labels"]),
+        fewest_opaque=config.fewest_opaque,
+        most_ghosts=config.most_ghosts,
+    )
     photos, _, width, _ = photographed.images.shape
     provenance = {
-        "recipe": "harvest", "seed": seed, "scene": index, "photos": photos, "photo_width": width, "steps": steps,
-        "field": kind, "resolution": resolution, "field_pitch": field.field_pitch,
-        "psnr": round(float(report["psnr"]), 3), "config": dataclasses.asdict(config),
-        "licence": " AND ".join(sorted({"generated", *(mesh["licence"] for mesh in meshes)})), "meshes": meshes,
-    }  # fmt: skip
+        "recipe": "harvest",
+        "seed": seed,
+        "scene": index,
+        "photos": photos,
+        "photo_width": width,
+        "steps": steps,
+        "field": kind,
+        "resolution": resolution,
+        "field_pitch": field.field_pitch,
+        "psnr": round(float(report["psnr"]), 3),
+        "config": dataclasses.asdict(config),
+        "licence": " AND ".join(sorted({"generated", *(mesh["licence"] for mesh in meshes)})),
+        "meshes": meshes,
+    }
     return arrays, provenance
 
 

@@ -89,9 +89,13 @@ class Truth:
     """
 
     def __init__(
-        self, photographed: Photographed, aabb: NDArray[np.float64], *, observers: Observers | None = None,
+        self,
+        photographed: Photographed,
+        aabb: NDArray[np.float64],
+        *,
+        observers: Observers | None = None,
         nodes: int = 64,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.photographed, self.aabb = photographed, aabb
         self.observers: list[Observers] = [(photographed.true_cameras, photographed.depth_maps)]
         self.observers += [] if observers is None else [observers]

@@ -13,12 +13,26 @@ from xml.parsers import expat
 
 from .mesh_reading import Array, MeshRejected, no_triangles, trimesh_triangles
 
-_REMOVED = frozenset({
-    "library_materials", "library_effects", "library_images", "library_cameras", "library_lights",
-    "library_animations", "library_animation_clips", "library_physics_materials", "library_physics_models",
-    "library_physics_scenes", "library_force_fields", "bind_material", "instance_camera", "instance_light",
-    "instance_physics_scene", "extra",
-})  # fmt: skip
+_REMOVED = frozenset(
+    {
+        "library_materials",
+        "library_effects",
+        "library_images",
+        "library_cameras",
+        "library_lights",
+        "library_animations",
+        "library_animation_clips",
+        "library_physics_materials",
+        "library_physics_models",
+        "library_physics_scenes",
+        "library_force_fields",
+        "bind_material",
+        "instance_camera",
+        "instance_light",
+        "instance_physics_scene",
+        "extra",
+    }
+)
 _DEEPEST, _MOST_ELEMENTS, _MOST_INSTANCES = 256, 2_000_000, 100_000
 
 

@@ -139,8 +139,11 @@ class _Scene:
         kept = [m for m in used if faces[m]]
         nodes = []
         for old in order:
-            node = {k: tree["nodes"][old][k] for k in ("matrix", "translation", "rotation", "scale")
-                    if k in tree["nodes"][old]}  # fmt: skip
+            node = {
+                k: tree["nodes"][old][k]
+                for k in ("matrix", "translation", "rotation", "scale")
+                if k in tree["nodes"][old]
+            }
             if children := tree["nodes"][old].get("children"):
                 node["children"] = [place[child] for child in children]
             if tree["nodes"][old].get("mesh") in kept:
@@ -148,11 +151,14 @@ class _Scene:
             nodes.append(node)
         expected = sum(faces.get(tree["nodes"][old].get("mesh"), 0) for old in order)
         minimal: Json = {
-            "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [place[root] for root in roots]}],
-            "nodes": nodes, "meshes": [meshes[m] for m in kept],
+            "asset": {"version": "2.0"},
+            "scene": 0,
+            "scenes": [{"nodes": [place[root] for root in roots]}],
+            "nodes": nodes,
+            "meshes": [meshes[m] for m in kept],
             "accessors": [self._accessor(i) for i in self.accessors],
             "bufferViews": [self._view(i) for i in self.views],
-        }  # fmt: skip
+        }
         numbers = list(self.buffers)
         for view in minimal["bufferViews"]:
             view["buffer"] = numbers.index(view["buffer"])

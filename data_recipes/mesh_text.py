@@ -12,11 +12,44 @@ import numpy as np
 
 from .mesh_reading import Array, MeshRejected, decode_text, no_triangles, triangulate, trimesh_triangles
 
-_OBJ_SILENT = frozenset({
-    "vt", "vn", "vp", "p", "l", "o", "g", "s", "mg", "usemtl", "mtllib", "usemap", "maplib", "bevel", "c_interp",
-    "d_interp", "lod", "shadow_obj", "trace_obj", "cstype", "deg", "bmat", "step", "parm", "trim", "hole", "scrv",
-    "sp", "end", "con", "ctech", "stech", "call", "csh",
-})  # fmt: skip
+_OBJ_SILENT = frozenset(
+    {
+        "vt",
+        "vn",
+        "vp",
+        "p",
+        "l",
+        "o",
+        "g",
+        "s",
+        "mg",
+        "usemtl",
+        "mtllib",
+        "usemap",
+        "maplib",
+        "bevel",
+        "c_interp",
+        "d_interp",
+        "lod",
+        "shadow_obj",
+        "trace_obj",
+        "cstype",
+        "deg",
+        "bmat",
+        "step",
+        "parm",
+        "trim",
+        "hole",
+        "scrv",
+        "sp",
+        "end",
+        "con",
+        "ctech",
+        "stech",
+        "call",
+        "csh",
+    }
+)
 _OBJ_FREE_FORM = frozenset({"surf", "curv", "curv2", "bzp", "bsp", "cdc", "cdp", "res"})
 _OFF_HEADER = re.compile(r"(ST)?(C)?(N)?OFF")
 _FACET = re.compile(

@@ -43,9 +43,13 @@ class PairBatch:
 def _batch(chunk: Chunk, first: int) -> PairBatch:
     arrays = chunk.arrays
     return PairBatch(
-        dequantize_signed(arrays["inputs"])[:, None], unpack_labels(arrays["labels"]), arrays["severity"],
-        arrays["edge_fraction"], arrays["group"], first,
-    )  # fmt: skip
+        dequantize_signed(arrays["inputs"])[:, None],
+        unpack_labels(arrays["labels"]),
+        arrays["severity"],
+        arrays["edge_fraction"],
+        arrays["group"],
+        first,
+    )
 
 
 class OnlinePairs:

@@ -229,9 +229,11 @@ def page_text(
 ) -> str:
     """The whole page; see :func:`unghost.data_recipes.preview.write_preview` for what it shows."""
     keys = (
-        (SURFACE, "true surface"), (GHOST, "ghost: the input is opaque where nothing is"),
-        (MISSING, "missing: surface that the input lacks"), (UNJUDGED, "not judged"),
-    )  # fmt: skip
+        (SURFACE, "true surface"),
+        (GHOST, "ghost: the input is opaque where nothing is"),
+        (MISSING, "missing: surface that the input lacks"),
+        (UNJUDGED, "not judged"),
+    )
     legend = "".join(f'<i style="background:{_color(color)}"></i>{text}' for color, text in keys)
     rows = [
         [_name(key), *(_number(facts[key][mark]) for mark in ("mean", "p10", "median", "p90")), text]

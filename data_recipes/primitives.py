@@ -205,7 +205,28 @@ BOUNDS: tuple[Family, ...] = (leaf, terrain, rock, superquadric, twisted_bar, sp
 FAMILIES: dict[str, Family] = {
     family.__name__: family
     for family in (
-        wall, wedge, ball, ellipsoid, box, rounded_box, panel, rod, cylinder, tube, capsule, cone, torus, cable, sheet,
-        stairs, ridges, studs, lattice, prism, lathe, grating, *BOUNDS,
+        wall,
+        wedge,
+        ball,
+        ellipsoid,
+        box,
+        rounded_box,
+        panel,
+        rod,
+        cylinder,
+        tube,
+        capsule,
+        cone,
+        torus,
+        cable,
+        sheet,
+        stairs,
+        ridges,
+        studs,
+        lattice,
+        prism,
+        lathe,
+        grating,
+        *BOUNDS,
     )
-}  # fmt: skip
+}

@@ -123,12 +123,16 @@ class Recipe:
                 if not isinstance(number, int) or isinstance(number, bool) or number < least:
                     raise ValueError(f"Recipe: {name} must be whole and >= {least}, got {value!r}")
         if not self.severity_exponent > 0 or not 0 <= self.center_jitter <= 0.5:
-            raise ValueError("Recipe: severity_exponent must be > 0 and center_jitter in [0, 0.5], "
-                             f"got {self.severity_exponent} and {self.center_jitter}")  # fmt: skip
+            raise ValueError(
+                "Recipe: severity_exponent must be > 0 and center_jitter in [0, 0.5], "
+                f"got {self.severity_exponent} and {self.center_jitter}"
+            )
 
         if not (self.remesh_edge == 0 or (self.repair and 0.001 <= self.remesh_edge <= 0.5)):
-            raise ValueError("Recipe: remesh_edge must be 0, or in [0.001, 0.5] where repair is true, "
-                             f"got {self.remesh_edge} with repair = {str(self.repair).lower()}")  # fmt: skip
+            raise ValueError(
+                "Recipe: remesh_edge must be 0, or in [0.001, 0.5] where repair is true, "
+                f"got {self.remesh_edge} with repair = {str(self.repair).lower()}"
+            )
 
     def _pair(self, name: str) -> tuple[float, float]:
         value = getattr(self, name)

@@ -64,9 +64,12 @@ def topology(triangles: Array) -> Topology:
     _, owner, uses = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
     balance = np.bincount(owner.ravel(), weights=np.where(forward, 1, -1))
     return Topology(
-        len(faces), int((uses == 1).sum()), int((uses > 2).sum()), int(((uses == 2) & (balance != 0)).sum()),
+        len(faces),
+        int((uses == 1).sum()),
+        int((uses > 2).sum()),
+        int(((uses == 2) & (balance != 0)).sum()),
         int((balance != 0).sum()),
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True)
@@ -92,10 +95,11 @@ class RepairOptions:
 
     def __post_init__(self) -> None:
         ranges = {
-            "merge_distance": 0 <= self.merge_distance <= 0.01, "largest_hole": self.largest_hole >= 0,
+            "merge_distance": 0 <= self.merge_distance <= 0.01,
+            "largest_hole": self.largest_hole >= 0,
             "remesh_edge": self.remesh_edge == 0 or 0.001 <= self.remesh_edge <= 0.5,
             "remesh_rounds": 1 <= self.remesh_rounds <= 20,
-        }  # fmt: skip
+        }
         for name, fits in ranges.items():
             if not fits:
                 raise ValueError(f"RepairOptions: {name} is outside its range, got {getattr(self, name)}")

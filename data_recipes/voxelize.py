@@ -103,9 +103,13 @@ def _voxelize(triangles: Array, cubes: Array, count: int, resolution: int) -> Oc
     rows = np.arange(len(inside))
     strides = np.array([resolution**2, resolution, 1])[order]
     turned = _Turned(
-        corners[order[:, None], np.arange(3)[None, :, None], rows], normals[order, rows],
-        first[order, rows], last[order, rows], strides, cubes * resolution**3,
-    )  # fmt: skip
+        corners[order[:, None], np.arange(3)[None, :, None], rows],
+        normals[order, rows],
+        first[order, rows],
+        last[order, rows],
+        strides,
+        cubes * resolution**3,
+    )
     columns = np.cumsum((turned.last[:2] - turned.first[:2] + 1).prod(axis=0))
     cuts = [0, *(np.flatnonzero(np.diff(columns // _BLOCK)) + 1), len(inside)]
     flat = occupancy.reshape(-1)

@@ -82,8 +82,14 @@ def draw_birds_eye(
     grid = figure.subplots(1, len(panels), squeeze=False)
     for axes, (told, black, red) in zip(grid[0], panels):
         found = difficulty(black, red, factor=unit)
-        _panel(axes, [((each.origins - center) @ plane.T * unit, -each.camera_to_world[:, :, 2] @ plane.T)
-                      for each in (black, red)], found)  # fmt: skip
+        _panel(
+            axes,
+            [
+                ((each.origins - center) @ plane.T * unit, -each.camera_to_world[:, :, 2] @ plane.T)
+                for each in (black, red)
+            ],
+            found,
+        )
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
         axes.set_xlabel("seen from above, normalised units", fontsize=8.5, color="#555555")
         means = f"mean to nearest: {found.translation.mean():.2f}, {found.rotation_deg.mean():.1f}°"

@@ -197,8 +197,12 @@ def _knob(
             method.renders, truth, extent, convention=convention, within=kept, keys=_curve_keys(convention)
         )
         means = found.means() | found.pooled(("psnr",))
-        rows.append({"share_kept": float(share), **{key: means[key] for key in
-                     ("coverage", "psnr", "convention", "images_scored")}})  # fmt: skip
+        rows.append(
+            {
+                "share_kept": float(share),
+                **{key: means[key] for key in ("coverage", "psnr", "convention", "images_scored")},
+            }
+        )
     return rows
 
 
@@ -221,9 +225,12 @@ def _equal_coverage(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _differences(
-    scores: Mapping[str, SceneScores], shared: Mapping[str, SceneScores], references: Sequence[str],
-    draws: int, resamples: int,
-) -> list[dict[str, Any]]:  # fmt: skip
+    scores: Mapping[str, SceneScores],
+    shared: Mapping[str, SceneScores],
+    references: Sequence[str],
+    draws: int,
+    resamples: int,
+) -> list[dict[str, Any]]:
     rows = []
     for reference in references:
         for name in (each for each in scores if each not in references):
@@ -235,11 +242,17 @@ def _differences(
                 if found.count:
                     rows.append(
                         {
-                            "method": name, "against": reference, "convention": scores[name].convention,
-                            "metric": key, "difference": found.mean, "low": found.low, "high": found.high,
-                            "images": found.count, "images_undefined": found.undefined,
+                            "method": name,
+                            "against": reference,
+                            "convention": scores[name].convention,
+                            "metric": key,
+                            "difference": found.mean,
+                            "low": found.low,
+                            "high": found.high,
+                            "images": found.count,
+                            "images_undefined": found.undefined,
                         }
-                    )  # fmt: skip
+                    )
     return rows
 
 

@@ -64,57 +64,82 @@ class Convention:
 
 
 _RELEASED: dict[str, Any] = {
-    "psnr": "per_channel", "ssim": "premasked_over_mask", "lpips": "premasked_over_mask",
-}  # fmt: skip
+    "psnr": "per_channel",
+    "ssim": "premasked_over_mask",
+    "lpips": "premasked_over_mask",
+}
 _ALL = (
     Convention(
         "proper",
         "this project: nothing that is masked out is looked at; what is removed lowers the coverage beside it",
         (*IMAGE_KEYS, "flip", *GEOMETRY_KEYS, "coverage", *AGREEMENT_KEYS),
-        visible=True, depth_limit="scene", ssim="inside_mask", clipped_depth=True,
+        visible=True,
+        depth_limit="scene",
+        ssim="inside_mask",
+        clipped_depth=True,
     ),
     Convention(
         "paper_text",
         "Nerfbusters, section 3. 'Masked versions' of SSIM and LPIPS are not specified: taken as the mean of the "
         "whole images' map over the mask",
         (*IMAGE_KEYS, *GEOMETRY_KEYS, "coverage"),
-        visible=True, depth_limit="scene", mean_over="images",
+        visible=True,
+        depth_limit="scene",
+        mean_over="images",
     ),
     Convention(
         "paper_code",
         "Nerfbusters, published scripts: 8-bit renders, images blanked before SSIM and LPIPS, unclipped pseudo "
         "depth, coverage of the visible pixels, depth limit 2 in nerfstudio's units",
         (*IMAGE_KEYS, *GEOMETRY_KEYS, "coverage"),
-        visible=True, depth_limit="unit", bits="round", coverage_of="visible", **_RELEASED,
+        visible=True,
+        depth_limit="unit",
+        bits="round",
+        coverage_of="visible",
+        **_RELEASED,
     ),
     Convention(
         "bayes_rays_masked",
         "Bayes' Rays, published evaluation with the visibility masks",
         (*IMAGE_KEYS, "coverage"),
-        visible=True, depth_limit="unit", coverage_of="visible", **_RELEASED,
+        visible=True,
+        depth_limit="unit",
+        coverage_of="visible",
+        **_RELEASED,
     ),
     Convention(
         "bayes_rays_unmasked",
         "Bayes' Rays, published evaluation without them: what no training view saw counts too",
         (*IMAGE_KEYS, "coverage"),
-        visible=False, depth_limit="unit", **_RELEASED,
+        visible=False,
+        depth_limit="unit",
+        **_RELEASED,
     ),
     Convention(
         "free_space_prior",
         "'Optimize the Unseen', published evaluation: the mask is the predicted accumulation alone, visibility enters "
         "coverage and Dice only; its 'Dice' is the share of pixels on which the masks agree",
         (*IMAGE_KEYS, "coverage", "dice"),
-        visible=False, depth_limit=None, accumulation=0.98, coverage_of="visible", dice="pixel_accuracy", **_RELEASED,
+        visible=False,
+        depth_limit=None,
+        accumulation=0.98,
+        coverage_of="visible",
+        dice="pixel_accuracy",
+        **_RELEASED,
     ),
     Convention(
         "nerfbaselines",
         "nerfbaselines' default protocol on images blanked by the paper's mask: 8 bits, everything averaged over all "
         "pixels",
         IMAGE_KEYS,
-        visible=True, depth_limit="scene", psnr="all_pixels", ssim="premasked_whole_windows", lpips="premasked",
+        visible=True,
+        depth_limit="scene",
+        psnr="all_pixels",
+        ssim="premasked_whole_windows",
+        lpips="premasked",
         bits="truncate",
     ),
-)  # fmt: skip
+)
 CONVENTIONS: Mapping[str, Convention] = MappingProxyType({each.name: each for each in _ALL})
 DEFAULT_CONVENTION = "proper"
 _PLAIN = (
@@ -123,15 +148,18 @@ _PLAIN = (
         "this project, for renders without depth: the pixels that the training photos saw, whatever was rendered "
         "there, so that coverage is the same for everybody",
         (*IMAGE_KEYS, "flip", "coverage"),
-        visible=True, depth_limit=None, ssim="inside_mask",
+        visible=True,
+        depth_limit=None,
+        ssim="inside_mask",
     ),
     Convention(
         "whole_image",
         "everybody's: nothing is masked, neither what no training photo saw nor what was removed",
         (*IMAGE_KEYS, "flip", "coverage"),
-        visible=False, depth_limit=None,
+        visible=False,
+        depth_limit=None,
     ),
-)  # fmt: skip
+)
 PLAIN_CONVENTIONS: Mapping[str, Convention] = MappingProxyType({each.name: each for each in _PLAIN})
 """Not the protocol's: what can be said of renders that come without depth, or of photos that come without masks."""
 

@@ -157,14 +157,16 @@ def compare(curves: Sequence[Curve], *, coverage: float | None = None) -> list[d
     for curve in curves:
         rows.append(
             {
-                "method": curve.method, "convention": curve.convention,
-                "coverage_low": float(curve.coverage[0]), "coverage_high": float(curve.coverage[-1]),
+                "method": curve.method,
+                "convention": curve.convention,
+                "coverage_low": float(curve.coverage[0]),
+                "coverage_high": float(curve.coverage[-1]),
                 "at_coverage": coverage,
                 f"{curve.metric}_at_coverage": None if coverage is None else curve.at(coverage),
                 "area_range": None if shared is None else list(shared),
                 f"{curve.metric}_area": None if shared is None or curve.is_point else curve.area(*shared),
             }
-        )  # fmt: skip
+        )
     return rows
 
 
@@ -184,10 +186,15 @@ def against_points(curves: Sequence[Curve]) -> list[dict[str, Any]]:
             ahead = None if found is None else (found - value) * (1 if curve.higher_is_better else -1)
             rows.append(
                 {
-                    "method": curve.method, "point": point.method, "convention": curve.convention, "coverage": there,
-                    curve.metric: found, f"{curve.metric}_point": value, "ahead": ahead,
+                    "method": curve.method,
+                    "point": point.method,
+                    "convention": curve.convention,
+                    "coverage": there,
+                    curve.metric: found,
+                    f"{curve.metric}_point": value,
+                    "ahead": ahead,
                 }
-            )  # fmt: skip
+            )
     return rows
 
 

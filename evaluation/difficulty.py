@@ -102,12 +102,14 @@ def difficulty_rows(train: Cameras, evaluation: Cameras, *, n: int = 8) -> list[
 
 def _row(method: str, found: Difficulty, train_photos: int) -> dict[str, Any]:
     return {
-        "method": method, "train_photos": train_photos, "photos": len(found.nearest),
+        "method": method,
+        "train_photos": train_photos,
+        "photos": len(found.nearest),
         "translation_to_nearest": float(found.translation.mean()),
         "translation_to_nearest_largest": float(found.translation.max()),
         "rotation_to_nearest_deg": float(found.rotation_deg.mean()),
         "rotation_to_nearest_deg_largest": float(found.rotation_deg.max()),
-    }  # fmt: skip
+    }
 
 
 def difficulty_text(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -30,10 +30,24 @@ from .mask_scores import coverage, mask_scores, predicted_mask
 from .similarity import SSIM_CONVENTIONS, ssim, ssim_map
 
 __all__ = [
-    "NORMAL_THRESHOLD", "PIXELS_PER_DEGREE", "PSNR_CONVENTIONS", "SSIM_CONVENTIONS", "backproject", "coverage",
-    "depth_mse", "disparity_mae", "flip", "flip_map", "mask_scores", "normal_errors", "normals_from_depth",
-    "predicted_mask", "psnr", "ssim", "ssim_map",
-]  # fmt: skip
+    "NORMAL_THRESHOLD",
+    "PIXELS_PER_DEGREE",
+    "PSNR_CONVENTIONS",
+    "SSIM_CONVENTIONS",
+    "backproject",
+    "coverage",
+    "depth_mse",
+    "disparity_mae",
+    "flip",
+    "flip_map",
+    "mask_scores",
+    "normal_errors",
+    "normals_from_depth",
+    "predicted_mask",
+    "psnr",
+    "ssim",
+    "ssim_map",
+]
 
 PSNR_CONVENTIONS: Mapping[str, str] = MappingProxyType(
     {

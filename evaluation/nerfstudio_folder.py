@@ -75,9 +75,11 @@ def write_nerfstudio(
                 shutil.copyfile(source, partial / name)
         lists = {sweep: [names[k] for k in indices] for sweep, indices in sweeps.items()}
         write_transforms(
-            partial / "transforms.json", capture.cameras.select(chosen), [names[k] for k in chosen],
+            partial / "transforms.json",
+            capture.cameras.select(chosen),
+            [names[k] for k in chosen],
             file_lists(lists["train"], lists["eval"]),
-        )  # fmt: skip
+        )
         write_splits(partial / "splits.json", lists)
 
 

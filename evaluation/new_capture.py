@@ -74,8 +74,9 @@ def make_capture(
         except ValueError as error:
             kept = {
                 source: _keep_frames(images, names[sweep], Path(f"{out}.{sweep}"))
-                for sweep, source in sources.items() if source.is_file()
-            }  # fmt: skip
+                for sweep, source in sources.items()
+                if source.is_file()
+            }
             if not kept:
                 raise
             said = " and ".join(f"those of {source} in {folder}" for source, folder in kept.items())
@@ -85,9 +86,12 @@ def make_capture(
         sweeps = {sweep: [f"images/{name}" for name in found] for sweep, found in posing.posed.items()}
         capture = load_capture(partial, downscale=1, normalize=False, splits=sweeps)
         write_transforms(
-            partial / "transforms.json", capture.cameras, capture.names,
-            file_lists(sweeps["train"], sweeps["eval"]), ply_file_path=f"{MODEL}/points3D.ply",
-        )  # fmt: skip
+            partial / "transforms.json",
+            capture.cameras,
+            capture.names,
+            file_lists(sweeps["train"], sweeps["eval"]),
+            ply_file_path=f"{MODEL}/points3D.ply",
+        )
         write_splits(partial / "splits.json", sweeps)
         told = _told(sources, taken, posing, how)
         (partial / "capture.json").write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
@@ -109,12 +113,17 @@ def _told(
     return {
         **{
             sweep: {
-                "source": source.name, "seen": taken[sweep].seen, "kept": len(taken[sweep].paths),
+                "source": source.name,
+                "seen": taken[sweep].seen,
+                "kept": len(taken[sweep].paths),
                 "posed": len(posing.posed[sweep]),
             }
             for sweep, source in sources.items()
         },
-        "unposed": list(posing.unposed), "reprojection_error": posing.reprojection_error, "points": posing.points,
-        "seed": how.seed, "versions": {name: version(name) for name in ("pycolmap", "av")},
+        "unposed": list(posing.unposed),
+        "reprojection_error": posing.reprojection_error,
+        "points": posing.points,
+        "seed": how.seed,
+        "versions": {name: version(name) for name in ("pycolmap", "av")},
         "frames": {path.name: was for each in taken.values() for path, was in zip(each.paths, each.sources)},
-    }  # fmt: skip
+    }

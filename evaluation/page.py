@@ -161,8 +161,11 @@ def _equal(rows: Sequence[Mapping[str, Any]], paint: Any) -> str:
     where = where if "psnr_at_coverage" in keys else None
     said = "Whoever removes more is scored on easier pixels, so these columns compare like with like: the pixels that "
     said += "count for every method here"
-    said += f", or a coverage of {number(where, 3)} each, the surest pixels of a method that says how sure it is." if (
-        where is not None) else "."  # fmt: skip
+    said += (
+        f", or a coverage of {number(where, 3)} each, the surest pixels of a method that says how sure it is."
+        if (where is not None)
+        else "."
+    )
     return f"<h3>At equal coverage</h3>{score_table(rows, keys, paint)}" + f'<p class="soft">{said}</p>'
 
 
@@ -174,8 +177,11 @@ def _coverage_charts(rows: Sequence[Mapping[str, Any]], colours: Mapping[str, in
     for scene in dict.fromkeys(row.get("scene") for row in rows):
         series = []
         for row in (each for each in rows if each.get("scene") == scene):
-            points = sorted((point["coverage"], point["psnr"]) for point in row.get("curve") or [row.get("point", row)]
-                            if _finite(point.get("coverage")) and _finite(point.get("psnr")))  # fmt: skip
+            points = sorted(
+                (point["coverage"], point["psnr"])
+                for point in row.get("curve") or [row.get("point", row)]
+                if _finite(point.get("coverage")) and _finite(point.get("psnr"))
+            )
             seed = f", seed {row['seed']}" if row.get("seed") is not None else ""
             notes = tuple(f"{y:.2f} dB at coverage {x:.3f}{seed}" for x, y in points)
             x, y = (tuple(values) for values in zip(*points)) if points else ((), ())
@@ -192,12 +198,20 @@ def _view_charts(rows: Sequence[Mapping[str, Any]], colours: Mapping[str, int]) 
     for row in rows:
         images = row.get("per_image") or []
         known = [(index + 1, each) for index, each in enumerate(images) if _finite(each.get("psnr"))]
-        series.append(Series(
-            str(row["method"]), tuple(float(index) for index, _ in known), tuple(each["psnr"] for _, each in known),
-            colours[str(row["method"])], tuple(f"{each['psnr']:.2f} dB, {each['name']}" for _, each in known),
-        ))  # fmt: skip
-    chart = line_chart(series, x_label="view, in order", y_label="PSNR, dB") if any(
-        len(each.x) > 1 for each in series) else ""  # fmt: skip
+        series.append(
+            Series(
+                str(row["method"]),
+                tuple(float(index) for index, _ in known),
+                tuple(each["psnr"] for _, each in known),
+                colours[str(row["method"])],
+                tuple(f"{each['psnr']:.2f} dB, {each['name']}" for _, each in known),
+            )
+        )
+    chart = (
+        line_chart(series, x_label="view, in order", y_label="PSNR, dB")
+        if any(len(each.x) > 1 for each in series)
+        else ""
+    )
     return [("PSNR of each view, dB", chart)] if chart else []
 
 
@@ -211,8 +225,17 @@ def _differences(results: Mapping[str, Any]) -> str:
         return ""
     ahead = results.get("against_points") or []
     if ahead:
-        cells = [[text(row["method"]), text(row["point"]), number(row["coverage"], 3), number(row["psnr"], 2),
-                  number(row["psnr_point"], 2), number(row["ahead"], 2)] for row in ahead]  # fmt: skip
+        cells = [
+            [
+                text(row["method"]),
+                text(row["point"]),
+                number(row["coverage"], 3),
+                number(row["psnr"], 2),
+                number(row["psnr_point"], 2),
+                number(row["ahead"], 2),
+            ]
+            for row in ahead
+        ]
         heads = ["curve", "point", "coverage of the point", "PSNR of the curve there", "of the point", "ahead by, dB"]
         parts += ["<h3>Curves against points, at the points' own coverage</h3>", table(heads, cells, kind="names")]
     return (

@@ -56,8 +56,10 @@ def line_chart(series: Sequence[Series], *, x_label: str, y_label: str, dots: bo
             HEIGHT - BOTTOM - (y - y_low) / (y_high - y_low) * (HEIGHT - TOP - BOTTOM),
         )
 
-    parts = [f'<svg class="chart" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{text(y_label)} over '
-             f'{text(x_label)}">']  # fmt: skip
+    parts = [
+        f'<svg class="chart" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{text(y_label)} over '
+        f'{text(x_label)}">'
+    ]
     for value in _ticks(y_low, y_high):
         y = place(x_low, value)[1]
         parts.append(f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>')

@@ -64,9 +64,14 @@ def worst_first(images: Sequence[Mapping[str, Any]], key: str) -> list[str]:
 
 
 def view_pictures(
-    names: Sequence[str], methods: Sequence[Method], truth: Truth, masks: Mapping[str, Mask],
-    rows: Sequence[Mapping[str, Any]], *, keys: Sequence[str],
-) -> list[ViewPictures]:  # fmt: skip
+    names: Sequence[str],
+    methods: Sequence[Method],
+    truth: Truth,
+    masks: Mapping[str, Mask],
+    rows: Sequence[Mapping[str, Any]],
+    *,
+    keys: Sequence[str],
+) -> list[ViewPictures]:
     """Pictures of some views.
 
     Args:
@@ -124,8 +129,10 @@ def image_tag(data: bytes, alt: str) -> str:
 def wipe(view: ViewPictures, left: str, right: str, number_of_view: int) -> str:
     """One view: two pictures under a slider, then all of them with their errors and numbers."""
     title = f"{number_of_view}. {view.name}"
-    thumbs = [f'<figure data-label="{text(PHOTO)}">{image_tag(view.shown[PHOTO], f"{view.name}: photo")}'
-              f"<figcaption><b>{PHOTO}</b></figcaption></figure>"]  # fmt: skip
+    thumbs = [
+        f'<figure data-label="{text(PHOTO)}">{image_tag(view.shown[PHOTO], f"{view.name}: photo")}'
+        f"<figcaption><b>{PHOTO}</b></figcaption></figure>"
+    ]
     for method, data in view.errors.items():
         alt = f"{view.name}: {method}"
         thumbs.append(
@@ -147,6 +154,9 @@ def wipe(view: ViewPictures, left: str, right: str, number_of_view: int) -> str:
 def _caption(row: Mapping[str, Any], keys: Sequence[str]) -> str:
     if not row["pixels"]:
         return "no pixel counts"
-    named = [(METRICS[key], number(row.get(key), METRICS[key].digits, infinite=key in row["infinite"])) for key in keys
-             if row.get(key) is not None or key in row["infinite"]]  # fmt: skip
+    named = [
+        (METRICS[key], number(row.get(key), METRICS[key].digits, infinite=key in row["infinite"]))
+        for key in keys
+        if row.get(key) is not None or key in row["infinite"]
+    ]
     return " · ".join(f"{metric.label.removesuffix(', dB')} {shown}" for metric, shown in named)

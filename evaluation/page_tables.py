@@ -87,10 +87,11 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]], *, kind: str = ""
     """A table of cells that are HTML already; it scrolls sideways where the screen is narrow."""
     top = "".join(f'<th scope="col">{head}</th>' for head in heads)
     body = "".join(
-        "<tr>" + "".join(f"<td>{cell}</td>" if n else f'<th scope="row">{cell}</th>' for n, cell in enumerate(row))
+        "<tr>"
+        + "".join(f"<td>{cell}</td>" if n else f'<th scope="row">{cell}</th>' for n, cell in enumerate(row))
         + "</tr>"
         for row in rows
-    )  # fmt: skip
+    )
     inner = f"<table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table>"
     return f'<div class="scroll {kind}" tabindex="0">{inner}</div>'
 
@@ -129,11 +130,13 @@ def score_table(
     cells = []
     for row in rows:
         name = text(row["method"])
-        cells.append([
-            name if swatch is None else swatch(str(row["method"])) + name,
-            *(text("–" if row.get(key) is None else row[key]) for key in labels),
-            *(_score(row, key) if _same_backbone(row, key, backbone) else "–" for key, backbone in columns),
-        ])  # fmt: skip
+        cells.append(
+            [
+                name if swatch is None else swatch(str(row["method"])) + name,
+                *(text("–" if row.get(key) is None else row[key]) for key in labels),
+                *(_score(row, key) if _same_backbone(row, key, backbone) else "–" for key, backbone in columns),
+            ]
+        )
     heads = [heading(key, "" if backbone is None else f" ({backbone})") for key, backbone in columns]
     return table(["method", *labels, *heads], cells)
 
@@ -162,10 +165,16 @@ def difference_table(rows: Sequence[Mapping[str, Any]]) -> str:
         if low is not None and (low > 0 or high < 0):
             verdict = ("better" if mean * known.better > 0 else "worse") if known.better else "differs"
         interval = "–" if low is None else f"{_signed(low, known.digits)} … {_signed(high, known.digits)}"
-        cells.append([
-            f"{text(row['method'])} − {text(row['against'])}", text(known.label), _signed(mean, known.digits), interval,
-            f'<span class="verdict {verdict.split()[0]}">{verdict}</span>', str(row["images"]),
-        ])  # fmt: skip
+        cells.append(
+            [
+                f"{text(row['method'])} − {text(row['against'])}",
+                text(known.label),
+                _signed(mean, known.digits),
+                interval,
+                f'<span class="verdict {verdict.split()[0]}">{verdict}</span>',
+                str(row["images"]),
+            ]
+        )
     return table(["", "metric", "difference", "interval", "", "views"], cells, kind="names verdicts")
 
 
@@ -190,10 +199,14 @@ def image_table(rows: Sequence[Mapping[str, Any]], order: Sequence[str], keys: S
     for name in order:
         for row, views in zip(rows, found):
             each = views[name]
-            cells.append([
-                text(name), text(row["method"]), str(each["pixels"]),
-                *(number(each.get(key), _digits(key), infinite=key in each.get("infinite", ())) for key in columns),
-            ])  # fmt: skip
+            cells.append(
+                [
+                    text(name),
+                    text(row["method"]),
+                    str(each["pixels"]),
+                    *(number(each.get(key), _digits(key), infinite=key in each.get("infinite", ())) for key in columns),
+                ]
+            )
     return table(["view", "method", "pixels", *map(heading, columns)], cells, kind="tall")
 
 

@@ -102,9 +102,10 @@ def pose_jointly(
         parts = _map(pycolmap, database, Path(folder), Path(scratch, "parts"), len(names), how, tell)
         counts = [_posed(part, sweeps) for part in parts]
         enough = [
-            number for number, posed in enumerate(counts)
+            number
+            for number, posed in enumerate(counts)
             if all(len(posed[sweep]) >= how.minimum_share * len(photos) for sweep, photos in sweeps.items())
-        ]  # fmt: skip
+        ]
         if not enough:
             raise ValueError(_complaint(counts, sweeps, how.minimum_share))
         best = max(enough, key=lambda number: sum(map(len, counts[number].values())))
@@ -137,9 +138,14 @@ def _extract(
                 reader.existing_camera_id = camera
             chosen = list(names[start : start + EXTRACT_AT_ONCE])
             pycolmap.extract_features(
-                database, folder, image_names=chosen, camera_mode=pycolmap.CameraMode.SINGLE, reader_options=reader,
-                extraction_options=options, device=pycolmap.Device.cpu,
-            )  # fmt: skip
+                database,
+                folder,
+                image_names=chosen,
+                camera_mode=pycolmap.CameraMode.SINGLE,
+                reader_options=reader,
+                extraction_options=options,
+                device=pycolmap.Device.cpu,
+            )
             done += len(chosen)
     tell("features", total, total)
 
@@ -157,9 +163,12 @@ def _match(pycolmap: Any, database: Path, names: Sequence[str], how: PosingSetti
         lines = (f"{one} {other}\n" for one, other in pairs[start : start + MATCH_AT_ONCE])
         database.with_name("pairs.txt").write_text("".join(lines), encoding="utf-8")
         pycolmap.match_image_pairs(
-            database, matching_options=options, pairing_options=chosen, verification_options=verification,
+            database,
+            matching_options=options,
+            pairing_options=chosen,
+            verification_options=verification,
             device=pycolmap.Device.cpu,
-        )  # fmt: skip
+        )
     tell("pairs", len(pairs), len(pairs))
 
 
@@ -175,9 +184,13 @@ def _map(
     steps = _counted(total, tell)
     parts.mkdir()
     found = pycolmap.incremental_mapping(
-        database, folder, parts, options=options,
-        initial_image_pair_callback=lambda: (next(steps), next(steps)), next_image_callback=lambda: next(steps),
-    )  # fmt: skip
+        database,
+        folder,
+        parts,
+        options=options,
+        initial_image_pair_callback=lambda: (next(steps), next(steps)),
+        next_image_callback=lambda: next(steps),
+    )
     return [found[number] for number in sorted(found)]
 
 

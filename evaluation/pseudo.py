@@ -91,12 +91,16 @@ class PseudoTruth:
             arrays |= {f"{side}_{name}": getattr(cameras, name) for name in LENSES}
         arrays = {name: np.ascontiguousarray(values, dtype=_dtype(name)) for name, values in arrays.items()}
         manifest = {
-            "format": FORMAT, "format_version": FORMAT_VERSION, "names": list(self.names),
+            "format": FORMAT,
+            "format_version": FORMAT_VERSION,
+            "names": list(self.names),
             "eval_size": [self.eval_cameras.width, self.eval_cameras.height],
             "train_size": [self.train_cameras.width, self.train_cameras.height],
-            "depth_limit": self.extent.limit, "tolerance": self.tolerance,
-            "sha256": {name: _digest(values) for name, values in arrays.items()}, "details": dict(self.details),
-        }  # fmt: skip
+            "depth_limit": self.extent.limit,
+            "tolerance": self.tolerance,
+            "sha256": {name: _digest(values) for name, values in arrays.items()},
+            "details": dict(self.details),
+        }
         target = Path(path)
         partial = target.with_name(target.name + ".partial")
         try:
@@ -149,10 +153,16 @@ def make_pseudo_truth(
     except (TypeError, ValueError) as error:
         raise ValueError(f"make_pseudo_truth: details must be JSON without NaN ({error})") from None
     result = PseudoTruth(
-        eval_cameras, train_cameras, single, np.asarray(normals, dtype=np.float32), _counts(frustum),
-        None if hidden is None else _counts(hidden), None if hidden is None else float(tolerance), labels,
+        eval_cameras,
+        train_cameras,
+        single,
+        np.asarray(normals, dtype=np.float32),
+        _counts(frustum),
+        None if hidden is None else _counts(hidden),
+        None if hidden is None else float(tolerance),
+        labels,
         dict(details or {}),
-    )  # fmt: skip
+    )
     _check("make_pseudo_truth", result)
     return result
 
@@ -176,9 +186,16 @@ def load_pseudo_truth(
     try:
         lenses = {side: _cameras(side, manifest, arrays) for side in ("eval", "train")}
         result = PseudoTruth(
-            lenses["eval"], lenses["train"], arrays["depth"], arrays["normals"], arrays["seen_frustum"],
-            arrays.get("seen_open"), manifest["tolerance"], tuple(manifest["names"]), dict(manifest["details"]),
-        )  # fmt: skip
+            lenses["eval"],
+            lenses["train"],
+            arrays["depth"],
+            arrays["normals"],
+            arrays["seen_frustum"],
+            arrays.get("seen_open"),
+            manifest["tolerance"],
+            tuple(manifest["names"]),
+            dict(manifest["details"]),
+        )
         _check("load_pseudo_truth", result)
         stated = float(manifest["depth_limit"])
     except (KeyError, TypeError, ValueError) as error:

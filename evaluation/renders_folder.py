@@ -257,8 +257,9 @@ def _load(path: Path) -> Any:
 
 def _checked(where: str, values: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
     if values.shape[1:] != shape or not np.issubdtype(values.dtype, np.floating):
-        raise ValueError(f"{where} must be floating point of shape {shape} a view, got {values.dtype} "
-                         f"{values.shape[1:]}")  # fmt: skip
+        raise ValueError(
+            f"{where} must be floating point of shape {shape} a view, got {values.dtype} {values.shape[1:]}"
+        )
     return values
 
 

@@ -13,9 +13,17 @@ from .conventions import get_convention, one_convention
 from .protocol import json_ready
 
 TABLE_KEYS = (
-    "psnr", "ssim", "depth_mse", "disparity_mae", "normal_mean_deg", "normal_median_deg", "normal_pct_30",
-    "coverage", "psnr_common", "psnr_visible",
-)  # fmt: skip
+    "psnr",
+    "ssim",
+    "depth_mse",
+    "disparity_mae",
+    "normal_mean_deg",
+    "normal_median_deg",
+    "normal_pct_30",
+    "coverage",
+    "psnr_common",
+    "psnr_visible",
+)
 
 
 def mean_over_seeds(method: str, per_seed: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -200,8 +200,11 @@ def summarize(
     for key in rule.keys:
         found_interval = bootstrap_scenes(
             {name: each.values(key) for name, each in scenes.items()},
-            rng, level=level, resamples=resamples, mean_over=rule.mean_over,
-        )  # fmt: skip
+            rng,
+            level=level,
+            resamples=resamples,
+            mean_over=rule.mean_over,
+        )
         row[key] = found_interval.mean
         intervals[key] = [found_interval.low, found_interval.high]
     per_scene = {name: each.means() for name, each in scenes.items()}
@@ -226,9 +229,15 @@ def _absent(rule: Convention, renders: Renders, truth: Truth, network: Lpips | N
 
 
 def _image_scores(
-    rule: Convention, renders: Renders, truth: Truth, mask: Mask, index: int, wanted: Sequence[str],
-    network: Lpips | None, pixels_per_degree: float,
-) -> dict[str, float]:  # fmt: skip
+    rule: Convention,
+    renders: Renders,
+    truth: Truth,
+    mask: Mask,
+    index: int,
+    wanted: Sequence[str],
+    network: Lpips | None,
+    pixels_per_degree: float,
+) -> dict[str, float]:
     preds, target = (_through_bits(images[index], rule.bits) for images in (renders.colours, truth.photos))
     result: dict[str, float] = {}
     if "psnr" in wanted:
@@ -250,9 +259,14 @@ def _through_bits(image: NDArray[Any], bits: str | None) -> NDArray[Any]:
 
 
 def _geometry_scores(
-    rule: Convention, renders: Renders, truth: Truth, mask: Mask, index: int, wanted: Sequence[str],
+    rule: Convention,
+    renders: Renders,
+    truth: Truth,
+    mask: Mask,
+    index: int,
+    wanted: Sequence[str],
     extent: SceneExtent | None,
-) -> dict[str, float]:  # fmt: skip
+) -> dict[str, float]:
     result: dict[str, float] = {}
     depth, pseudo = (None if each.depth is None else each.depth[index].astype(np.float64) for each in (renders, truth))
     surface = pseudo

@@ -68,8 +68,9 @@ def sparsify(
         ValueError: shapes, an unknown name, no pixel, errors that are negative or not finite, a NaN uncertainty.
     """
     for name, value, choices in (
-        ("reduction", reduction, REDUCTIONS), ("normalization", normalization, NORMALIZATIONS)
-    ):  # fmt: skip
+        ("reduction", reduction, REDUCTIONS),
+        ("normalization", normalization, NORMALIZATIONS),
+    ):
         if value not in choices:
             raise ValueError(f"sparsify: {name} must be one of {', '.join(choices)}, got {value!r}")
     if steps < 2:

@@ -17,8 +17,12 @@ from ..core.cameras import Cameras
 DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
 LENS_KEYS = ("fl_x", "fl_y", "cx", "cy")
 BENDS = {  # camera model -> what may differ from 0 in it
-    "OPENCV": DISTORTION_KEYS, "PINHOLE": (), "SIMPLE_PINHOLE": (), "SIMPLE_RADIAL": ("k1",), "RADIAL": ("k1", "k2"),
-}  # fmt: skip
+    "OPENCV": DISTORTION_KEYS,
+    "PINHOLE": (),
+    "SIMPLE_PINHOLE": (),
+    "SIMPLE_RADIAL": ("k1",),
+    "RADIAL": ("k1", "k2"),
+}
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -145,9 +149,14 @@ def write_transforms(
         frames.append({"file_path": name, **own, "transform_matrix": [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]]})
     shared = dict(zip(keys, lenses[0].tolist())) if alike else {}
     content = {
-        "camera_model": "OPENCV", "w": cameras.width, "h": cameras.height, **shared, **extra,
-        **{key: list(files) for key, files in lists.items()}, "frames": frames,
-    }  # fmt: skip
+        "camera_model": "OPENCV",
+        "w": cameras.width,
+        "h": cameras.height,
+        **shared,
+        **extra,
+        **{key: list(files) for key, files in lists.items()},
+        "frames": frames,
+    }
     target = Path(path)
     partial = target.with_name(target.name + ".partial")
     partial.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")

@@ -49,10 +49,14 @@ def make(path: Path) -> None:
     cells = np.empty(CELLS**3)
     cells[morton_index().ravel()] = (density * SHORTEST_STEP).ravel()
     snapshot = {
-        "version": 1, "mode": "nerf", "params_binary": bytes(1000), "density_grid_size": CELLS,
-        "density_grid_binary": cells.astype("<f2").tobytes(), "aabb": {"min": [0.0] * 3, "max": [1.0] * 3},
+        "version": 1,
+        "mode": "nerf",
+        "params_binary": bytes(1000),
+        "density_grid_size": CELLS,
+        "density_grid_binary": cells.astype("<f2").tobytes(),
+        "aabb": {"min": [0.0] * 3, "max": [1.0] * 3},
         "nerf": {"aabb_scale": 1, "dataset": {"scale": 0.33, "offset": [0.5, 0.5, 0.5], "from_mitsuba": 0}},
-    }  # fmt: skip
+    }
     path.write_bytes(msgpack({"snapshot": snapshot}))
 
 

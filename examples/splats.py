@@ -16,8 +16,18 @@ import numpy as np
 from unghost.fields.splat_ply import read_splat_ply
 from unghost.splat_cleaning import clean_ply
 
-NAMES = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *(f"scale_{i}" for i in range(3)),
-         *(f"rot_{i}" for i in range(4)), "made_as"]  # fmt: skip
+NAMES = [
+    "x",
+    "y",
+    "z",
+    "f_dc_0",
+    "f_dc_1",
+    "f_dc_2",
+    "opacity",
+    *(f"scale_{i}" for i in range(3)),
+    *(f"rot_{i}" for i in range(4)),
+    "made_as",
+]
 
 
 def make(path: Path, seed: int = 0) -> None:

@@ -11,9 +11,33 @@ from numpy.typing import NDArray
 OPSET = 18
 IR_VERSION = 8
 OPERATORS = frozenset(
-    ("Add", "Cast", "Concat", "Conv", "ConvTranspose", "Cos", "DepthToSpace", "Div", "Gather", "Gemm", "LeakyRelu",
-     "Log", "Mul", "Pad", "Relu", "Reshape", "Sin", "Slice", "Split", "Sqrt", "Sub", "Tanh", "Transpose", "Unsqueeze")
-)  # all that an exported model may use  # fmt: skip
+    (
+        "Add",
+        "Cast",
+        "Concat",
+        "Conv",
+        "ConvTranspose",
+        "Cos",
+        "DepthToSpace",
+        "Div",
+        "Gather",
+        "Gemm",
+        "LeakyRelu",
+        "Log",
+        "Mul",
+        "Pad",
+        "Relu",
+        "Reshape",
+        "Sin",
+        "Slice",
+        "Split",
+        "Sqrt",
+        "Sub",
+        "Tanh",
+        "Transpose",
+        "Unsqueeze",
+    )
+)  # all that an exported model may use
 
 
 class GraphBuilder:

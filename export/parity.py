@@ -178,9 +178,14 @@ def compare(exported: Denoiser, reference: Denoiser, inputs: ParityInputs) -> di
     allowed = TOLERANCES[precision]
     passed = worst <= allowed.max_error and total / voxels <= allowed.mean_error and flips / voxels <= allowed.flip_rate
     return {
-        "cubes": len(inputs.channels), "max_error": worst, "mean_error": total / voxels, "flips": flips,
-        "flip_rate": flips / voxels, "precision": precision, "passed": passed,
-    }  # fmt: skip
+        "cubes": len(inputs.channels),
+        "max_error": worst,
+        "mean_error": total / voxels,
+        "flips": flips,
+        "flip_rate": flips / voxels,
+        "precision": precision,
+        "passed": passed,
+    }
 
 
 def verify(

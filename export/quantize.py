@@ -147,10 +147,17 @@ def int8_body(body: bytes, calibration: ParityInputs) -> bytes:
     with tempfile.TemporaryDirectory(prefix="unghost.") as folder:
         written = Path(folder) / "int8.onnx"
         quantize_static(
-            model, written, _Reader(calibration), quant_format=QuantFormat.QDQ, per_channel=True, reduce_range=True,
-            op_types_to_quantize=list(QUANTISED), nodes_to_quantize=chosen, activation_type=QuantType.QUInt8,
+            model,
+            written,
+            _Reader(calibration),
+            quant_format=QuantFormat.QDQ,
+            per_channel=True,
+            reduce_range=True,
+            op_types_to_quantize=list(QUANTISED),
+            nodes_to_quantize=chosen,
+            activation_type=QuantType.QUInt8,
             weight_type=QuantType.QInt8,
-        )  # fmt: skip
+        )
         quantised = onnx.load(written)
     quantised.ClearField("metadata_props")
     quantised.producer_name, quantised.producer_version = "unghost", ""
@@ -184,9 +191,14 @@ def in_precision(manifest: Manifest, precision: str, facts: dict[str, Any]) -> M
 
 
 def convert_onnx(
-    onnx_path: str | Path, out_path: str | Path, *, precision: str, calibration: ParityInputs | None = None,
-    source: str = "", verify_cubes: int = 0,
-) -> Manifest:  # fmt: skip
+    onnx_path: str | Path,
+    out_path: str | Path,
+    *,
+    precision: str,
+    calibration: ParityInputs | None = None,
+    source: str = "",
+    verify_cubes: int = 0,
+) -> Manifest:
     """Write an exported float32 file in another precision.
 
     Args:
@@ -228,9 +240,14 @@ def convert_onnx(
 
 
 def export_precisions(
-    checkpoint_path: str | Path, folder: str | Path, *, precisions: Sequence[str] = PRECISIONS,
-    calibration: ParityInputs | None = None, source: str = "", verify_cubes: int = 8,
-) -> dict[str, Path]:  # fmt: skip
+    checkpoint_path: str | Path,
+    folder: str | Path,
+    *,
+    precisions: Sequence[str] = PRECISIONS,
+    calibration: ParityInputs | None = None,
+    source: str = "",
+    verify_cubes: int = 8,
+) -> dict[str, Path]:
     """Write a checkpoint, or its fp32 export, as ``NAME.onnx``, ``NAME.fp16.onnx`` and ``NAME.int8.onnx``.
 
     Args:

@@ -73,9 +73,15 @@ class Blend:
     """
 
     def __init__(
-        self, mixture: Mixture | None, online: Sequence[Online], *, batch_size: int, channels: Sequence[str], seed: int,
+        self,
+        mixture: Mixture | None,
+        online: Sequence[Online],
+        *,
+        batch_size: int,
+        channels: Sequence[str],
+        seed: int,
         redraw_edges: bool = True,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.mixture, self.online, self.channels, self.seed = mixture, list(online), tuple(channels), seed
         self.redraw_edges = redraw_edges
         self.counts = split_batch(batch_size, [part.share for part in online])

@@ -79,8 +79,15 @@ class TrainConfig:
     init_from: str = ""
 
     def __post_init__(self) -> None:
-        positive = ("steps", "batch_size", "learning_rate", "gradient_clip", "interesting_weight", "keep_weight",
-                    "validate_cubes")  # fmt: skip
+        positive = (
+            "steps",
+            "batch_size",
+            "learning_rate",
+            "gradient_clip",
+            "interesting_weight",
+            "keep_weight",
+            "validate_cubes",
+        )
         for name in (*positive, "checkpoint_seconds"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):

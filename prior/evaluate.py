@@ -85,9 +85,14 @@ def _denoise(denoiser: Denoiser, channels: NDArray[np.float32], timestep: int, e
 
 
 def evaluate(
-    denoiser: Denoiser, shard: Shard, *, timestep: int | None = None, limit: int | None = None, batch_size: int = 64,
+    denoiser: Denoiser,
+    shard: Shard,
+    *,
+    timestep: int | None = None,
+    limit: int | None = None,
+    batch_size: int = 64,
     without: Collection[str] = (),
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """IoU before and after, and how many ghosts go when nearly all of the true surface stays.
 
     Occupied is opacity > 0.1 in the input, ``x0_pred`` > 0 in the output, "surface" in the label; ignored
@@ -125,10 +130,14 @@ def evaluate(
             curve.add(score, opaque & surface, opaque & (labels == FREE_LABEL))
     severity = np.array(shard.severity[chosen])
     return {
-        "cubes": len(chosen), "timestep": int(step), "iou_before": _mean(before), "iou": _mean(after),
-        "iou_clean": _mean(after[severity == 0.0]), "by_severity": _by_severity(severity, before, after),
+        "cubes": len(chosen),
+        "timestep": int(step),
+        "iou_before": _mean(before),
+        "iou": _mean(after),
+        "iou_clean": _mean(after[severity == 0.0]),
+        "by_severity": _by_severity(severity, before, after),
         **_ghost_scores(learned, raw),
-    }  # fmt: skip
+    }
 
 
 def _mean(values: NDArray[Any]) -> float | None:
@@ -141,9 +150,14 @@ def _by_severity(severity: NDArray[Any], before: NDArray[Any], after: NDArray[An
         inside = (severity > low) & (severity <= high)
         if inside.any():
             rows.append(
-                {"severity_from": low, "severity_to": high, "cubes": int(inside.sum()),
-                 "iou_before": _mean(before[inside]), "iou": _mean(after[inside])}
-            )  # fmt: skip
+                {
+                    "severity_from": low,
+                    "severity_to": high,
+                    "cubes": int(inside.sum()),
+                    "iou_before": _mean(before[inside]),
+                    "iou": _mean(after[inside]),
+                }
+            )
     return rows
 
 

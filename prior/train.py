@@ -90,8 +90,12 @@ def _by_folder(shards: Sequence[tuple[str | Path, float]], lengths: Sequence[int
     for (path, weight), cubes in zip(shards, lengths):
         name, source = Path(path).name, Path(path).parent.name
         entry = groups.setdefault(source, {"source": source, "first": name, "shards": 0, "cubes": 0, "weight": 0.0})
-        entry |= {"last": name, "shards": entry["shards"] + 1, "cubes": entry["cubes"] + cubes,
-                  "weight": entry["weight"] + weight}  # fmt: skip
+        entry |= {
+            "last": name,
+            "shards": entry["shards"] + 1,
+            "cubes": entry["cubes"] + cubes,
+            "weight": entry["weight"] + weight,
+        }
     return [entry | {"weight": round(entry["weight"], 6)} for entry in groups.values()]
 
 
@@ -99,24 +103,36 @@ def _provenance(trainer: Trainer, shards: Sequence[tuple[str | Path, float]], bl
     config = trainer.config
     opened = [] if blend.mixture is None else blend.mixture.shards
     return {
-        "seed": config.seed, "steps": trainer.step, "seconds": round(trainer.elapsed, 1),
-        "batch_size": config.batch_size, "precision": "bf16" if trainer.bf16 else "fp32", "commit": commit(),
-        "torch": versions().get("torch", ""), "gflop": round(network_gflop(config.network), 4),
-        "objective": config.objective, "learning_rate": config.learning_rate, "keep_weight": config.keep_weight,
-        "threshold_from": config.threshold_from, "started_from": trainer.started_from,
+        "seed": config.seed,
+        "steps": trainer.step,
+        "seconds": round(trainer.elapsed, 1),
+        "batch_size": config.batch_size,
+        "precision": "bf16" if trainer.bf16 else "fp32",
+        "commit": commit(),
+        "torch": versions().get("torch", ""),
+        "gflop": round(network_gflop(config.network), 4),
+        "objective": config.objective,
+        "learning_rate": config.learning_rate,
+        "keep_weight": config.keep_weight,
+        "threshold_from": config.threshold_from,
+        "started_from": trainer.started_from,
         "shards": _by_folder(shards, [len(shard) for shard in opened]),
         "drop_channels": config.drop_channels,
         "online": [{"name": part.name, "share": part.share} for part in blend.online],
-    }  # fmt: skip
+    }
 
 
 def _manifest(trainer: Trainer, training: dict[str, Any], threshold: float = 0.0) -> Manifest:
     kind, timestep = family(trainer.network.config), trainer.config.default_timestep
     return Manifest(
-        name=trainer.config.name, family=kind, channels=trainer.config.network.channels, removal_threshold=threshold,
+        name=trainer.config.name,
+        family=kind,
+        channels=trainer.config.network.channels,
+        removal_threshold=threshold,
         default_timestep=DEFAULT_TIMESTEPS[kind] if timestep is None else timestep,
-        parameters=parameter_count(trainer.network), training=training,
-    )  # fmt: skip
+        parameters=parameter_count(trainer.network),
+        training=training,
+    )
 
 
 def _validate(trainer: Trainer, shards: Mapping[str, Shard], limit: int | None) -> dict[str, dict[str, Any]]:
@@ -177,9 +193,14 @@ def _check(trainer: Trainer, losses: LossWatch) -> None:
 
 
 def _run(
-    trainer: Trainer, blend: Blend, out: Path, log: _Log, validation: Mapping[str, Shard],
-    progress: bool, on_step: Callable[[int, Mapping[str, float]], None] | None,
-) -> str:  # fmt: skip
+    trainer: Trainer,
+    blend: Blend,
+    out: Path,
+    log: _Log,
+    validation: Mapping[str, Shard],
+    progress: bool,
+    on_step: Callable[[int, Mapping[str, float]], None] | None,
+) -> str:
     """Step until the budget is used; why it ended."""
     from tqdm import tqdm
 

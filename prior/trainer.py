@@ -71,8 +71,18 @@ class Trainer:
                 rewire(start.network, network)
             else:
                 raise ValueError(f"Trainer: init_from {config.init_from} has another network: {start.network.config}")
-            kept = ("seed", "steps", "seconds", "batch_size", "learning_rate", "commit", "shards", "started_from",
-                    "drop_channels", "keep_weight")  # fmt: skip
+            kept = (
+                "seed",
+                "steps",
+                "seconds",
+                "batch_size",
+                "learning_rate",
+                "commit",
+                "shards",
+                "started_from",
+                "drop_channels",
+                "keep_weight",
+            )
             digest = hashlib.sha256(Path(config.init_from).read_bytes()).hexdigest()
             earlier = {key: value for key, value in start.manifest.training.items() if key in kept}
             seen = list(start.manifest.channels)
@@ -144,9 +154,12 @@ class Trainer:
         for index, slots in self.optimizer.state_dict()["state"].items():
             tensors |= {f"optimizer.{index}.{name}": torch.as_tensor(value) for name, value in slots.items()}
         metadata = {
-            "step": str(self.step), "elapsed": repr(self.elapsed), "updates": str(self.average.updates),
-            "config": self.config.to_json(), CONFIG_KEY: "state",
-        }  # fmt: skip
+            "step": str(self.step),
+            "elapsed": repr(self.elapsed),
+            "updates": str(self.average.updates),
+            "config": self.config.to_json(),
+            CONFIG_KEY: "state",
+        }
         write_tensors(path, tensors, metadata)
 
     def restore(self, path: Path) -> None:

@@ -193,10 +193,19 @@ class Judgement:
         s = self.settings if strength is None else dataclasses.replace(self.settings, strength=strength)
         survey, shape = self._survey, self.score.shape
         threshold, part = threshold_of(s.strength, self.advised), survey.extent()
-        removed, faint = decide(
-            survey.occupied[part], survey.judged[part], self.score[part],
-            threshold=threshold, smallest=s.smallest, speck=s.speck, fringe=s.fringe,
-        ) if s.strength > 0 else (np.zeros_like(survey.judged[part]),) * 2  # fmt: skip
+        removed, faint = (
+            decide(
+                survey.occupied[part],
+                survey.judged[part],
+                self.score[part],
+                threshold=threshold,
+                smallest=s.smallest,
+                speck=s.speck,
+                fringe=s.fringe,
+            )
+            if s.strength > 0
+            else (np.zeros_like(survey.judged[part]),) * 2
+        )
         removed, faint = removed & ~survey.protected[part], faint & ~survey.protected[part]
         corner = [span.start * self.pitch for span in part]
         origin = lattice_origin(self.aabb, self.pitch, shape) + corner
@@ -204,10 +213,17 @@ class Judgement:
         keep = np.ones(shape, dtype=bool)
         keep[part] = ~(removed | faint)
         details = {
-            "occupied": int(survey.occupied.sum()), "removed": int(removed.sum()), "faint_removed": int(faint.sum()),
-            "asked": survey.asked, "dropped": survey.dropped, "threshold": threshold, **self._about,
-            "settings": dataclasses.asdict(s), "region_count": region_count, "regions": regions,
-        }  # fmt: skip
+            "occupied": int(survey.occupied.sum()),
+            "removed": int(removed.sum()),
+            "faint_removed": int(faint.sum()),
+            "asked": survey.asked,
+            "dropped": survey.dropped,
+            "threshold": threshold,
+            **self._about,
+            "settings": dataclasses.asdict(s),
+            "region_count": region_count,
+            "regions": regions,
+        }
         return KeepMask(self.aabb, self.pitch, keep, details)
 
 
@@ -232,9 +248,19 @@ def judge(
     pitch, shape = grid_of(box, s)
     query = make_query(density_fn, place=box.mean(axis=0), backend=s.backend, chunk=s.chunk, caller="clean")
     survey = survey_field(
-        query, box, pitch, shape, rule=s.rule, faint=s.faint, opaque_pitch=s.field_pitch or pitch, soft=s.soft,
-        keep_boxes=s.keep_boxes, probe=s.probe, drop_invalid=s.drop_invalid, rows=s.chunk,
-    )  # fmt: skip
+        query,
+        box,
+        pitch,
+        shape,
+        rule=s.rule,
+        faint=s.faint,
+        opaque_pitch=s.field_pitch or pitch,
+        soft=s.soft,
+        keep_boxes=s.keep_boxes,
+        probe=s.probe,
+        drop_invalid=s.drop_invalid,
+        rows=s.chunk,
+    )
     maps = light_maps(denoiser.manifest.channels, cameras, query, aabb=box, pitch=s.field_pitch or pitch)
     score, windows = _score(survey, denoiser, s, box, pitch, cameras, maps, progress)
     about = {"windows": windows, "denoiser": denoiser.manifest.name}
@@ -266,9 +292,15 @@ def threshold_of(strength: float, advised: float) -> float:
 
 
 def _score(
-    survey: Survey, denoiser: Denoiser, s: CleanSettings, aabb: NDArray[np.float64], pitch: float,
-    cameras: Cameras | None, maps: TransmittanceMaps | None, progress: Progress | None,
-) -> tuple[FloatGrid, int]:  # fmt: skip
+    survey: Survey,
+    denoiser: Denoiser,
+    s: CleanSettings,
+    aabb: NDArray[np.float64],
+    pitch: float,
+    cameras: Cameras | None,
+    maps: TransmittanceMaps | None,
+    progress: Progress | None,
+) -> tuple[FloatGrid, int]:
     """Weighted mean of the levels' votes, and the windows it took."""
     origin, names = lattice_origin(aabb, pitch, survey.signed.shape), denoiser.manifest.channels
     timestep = denoiser.manifest.default_timestep if s.timestep is None else s.timestep

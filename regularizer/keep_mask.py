@@ -139,9 +139,13 @@ class KeepMask:
         """Write ``.npz`` without pickles: ``manifest`` (JSON) and ``cells`` (bits, C order); whole or not at all."""
         target = Path(path)
         manifest = {
-            "format": FORMAT, "format_version": FORMAT_VERSION, "aabb": self.aabb.tolist(), "pitch": self.pitch,
-            "shape": list(self.cells.shape), "details": self.details,
-        }  # fmt: skip
+            "format": FORMAT,
+            "format_version": FORMAT_VERSION,
+            "aabb": self.aabb.tolist(),
+            "pitch": self.pitch,
+            "shape": list(self.cells.shape),
+            "details": self.details,
+        }
         partial = target.with_name(target.name + ".partial")
         try:
             with partial.open("wb") as stream:

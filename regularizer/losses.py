@@ -162,9 +162,13 @@ class _CubewiseMean(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, density: Tensor, loss: Callable[[Tensor, Tensor], Tensor], x0_pred: Tensor, factor: Tensor,
+        ctx: Any,
+        density: Tensor,
+        loss: Callable[[Tensor, Tensor], Tensor],
+        x0_pred: Tensor,
+        factor: Tensor,
         used: Tensor,
-    ) -> Tensor:  # fmt: skip
+    ) -> Tensor:
         """The mean; the gradient is worked out on the way."""
         count, total = max(int(used.sum()), 1), widest(density.new_zeros(()))
         gradient = torch.empty_like(density) if ctx.needs_input_grad[0] else None

@@ -222,9 +222,13 @@ class DensityRegularizer:
         if not self.grid.observed.any():
             self._bootstrap(fields[0], device)
         cubes = draw_cubes(
-            self.grid, self._rng(0), s, field_pitch=self.field_pitch,
-            resolution=self.denoiser.manifest.resolution, device=device,
-        )  # fmt: skip
+            self.grid,
+            self._rng(0),
+            s,
+            field_pitch=self.field_pitch,
+            resolution=self.denoiser.manifest.resolution,
+            device=device,
+        )
         self.report.update(cubes=s.cubes, voxels=cubes.inside.numel(), outside=int((~cubes.inside).sum()))
         losses = [self._dsds_of_field(field, cubes, index) for index, field in enumerate(fields)]
         return torch.stack(losses).sum() * s.dsds_weight
@@ -243,9 +247,11 @@ class DensityRegularizer:
         x0_pred = self._predict(density.detach(), cubes, field, index)
         factor = cubes.pitch if self.settings.rule.kind == "opacity" else torch.ones_like(cubes.pitch)
         loss = functools.partial(
-            dsds_loss, target_density=self.settings.target_density(),
-            threshold=self.threshold, fill_threshold=self.fill_threshold,
-        )  # fmt: skip
+            dsds_loss,
+            target_density=self.settings.target_density(),
+            threshold=self.threshold,
+            fill_threshold=self.fill_threshold,
+        )
         return cubewise_mean(loss, density, x0_pred, factor, used)
 
     def _predict(self, density: Tensor, cubes: CubeBatch, field: DensityFn, index: int) -> Tensor:
@@ -262,10 +268,14 @@ class DensityRegularizer:
                 return self._query(field, places)[0]
 
             channels = complete_channels(
-                self.denoiser.manifest.channels, channels, cubes, asked, viewing=self._viewing,
+                self.denoiser.manifest.channels,
+                channels,
+                cubes,
+                asked,
+                viewing=self._viewing,
                 maps=self._rays.through(ask, index=index, step=self.step, pitch=self._nominal_pitch(), like=density),
                 surroundings=lambda: cube_surroundings(ask, cubes, asked, aabb=self.aabb, rule=s.rule, soft=s.soft),
-            )  # fmt: skip
+            )
         t = s.timestep(self.step) if callable(s.timestep) else s.timestep
         t = self.denoiser.manifest.default_timestep if t is None else t
         timestep = int(check_timestep(t, caller="DensityRegularizer"))
@@ -280,8 +290,11 @@ class DensityRegularizer:
         for part in cube_parts(density):
             wide, pitch = widest(density[part]), cubes.pitch[part]
             # occupied, told without an exponential
-            asked.append((wide > s.rule.density_threshold(pitch)).flatten(1).any(dim=1) if s.skip_empty
-                         else torch.ones(len(wide), dtype=torch.bool, device=density.device))  # fmt: skip
+            asked.append(
+                (wide > s.rule.density_threshold(pitch)).flatten(1).any(dim=1)
+                if s.skip_empty
+                else torch.ones(len(wide), dtype=torch.bool, device=density.device)
+            )
             if bool(asked[-1].any()):
                 shown.append(s.rule.encode(wide[asked[-1]], pitch[asked[-1]], soft=s.soft).float())
         return torch.cat(asked), torch.cat(shown)[:, None] if shown else density[:0, None].float()

@@ -40,8 +40,9 @@ def total_variation_loss(grid: Tensor) -> Tensor:
         raise ValueError(f"total_variation_loss: grid must be (..., X, Y, Z) with sides >= 2, got {tuple(grid.shape)}")
     values = widest(grid)
     here = values[..., :-1, :-1, :-1]
-    steps = torch.stack([values[..., 1:, :-1, :-1] - here, values[..., :-1, 1:, :-1] - here,
-                         values[..., :-1, :-1, 1:] - here])  # fmt: skip
+    steps = torch.stack(
+        [values[..., 1:, :-1, :-1] - here, values[..., :-1, 1:, :-1] - here, values[..., :-1, :-1, 1:] - here]
+    )
     longest = steps.detach().abs().amax(0)
     flat = longest == 0
     unit = steps / torch.where(flat, torch.ones_like(longest), longest)

@@ -91,20 +91,24 @@ class RegularizerSettings:
             "seed": (self.seed >= 0, ">= 0"),
             "dsds_weight": (math.isfinite(self.dsds_weight) and self.dsds_weight >= 0, "finite and >= 0"),
             "visibility_weight": (
-                math.isfinite(self.visibility_weight) and self.visibility_weight >= 0, "finite and >= 0",
+                math.isfinite(self.visibility_weight) and self.visibility_weight >= 0,
+                "finite and >= 0",
             ),
             "visibility_reach": (
-                math.isfinite(self.visibility_reach) and self.visibility_reach >= 1, "finite and >= 1",
+                math.isfinite(self.visibility_reach) and self.visibility_reach >= 1,
+                "finite and >= 1",
             ),
             "uniform_share": (0.0 <= self.uniform_share <= 1.0, "in [0, 1]"),
             "strategy": (self.strategy in ("mixed", "importance", "uniform"), "mixed, importance or uniform"),
             "visibility_kind": (self.visibility_kind in ("mixed", "rays", "uniform"), "mixed, rays or uniform"),
             "edge_range": (self.edge_range is None or _is_range(self.edge_range), "0 < low <= high, finite"),
             "threshold": (self.threshold is None or -1 <= self.threshold <= 1, "in [-1, 1]"),
-            "target": (self.target is None or self.rule.threshold <= self.target < self._most_target(),
-                       f"in [{self.rule.threshold} (the rule's threshold), {self._most_target()})"),
+            "target": (
+                self.target is None or self.rule.threshold <= self.target < self._most_target(),
+                f"in [{self.rule.threshold} (the rule's threshold), {self._most_target()})",
+            ),
             "fill_threshold": (self.fill_threshold is None or -1 <= self.fill_threshold <= 1, "in [-1, 1]"),
-        }  # fmt: skip
+        }
         for name, (holds, rule) in rules.items():
             if not holds:
                 raise ValueError(f"DensityRegularizer: {name} must be {rule}, got {getattr(self, name)!r}")
@@ -125,8 +129,15 @@ class RegularizerSettings:
 
         The weights stay ours, as it gives none.
         """
-        known = {"threshold": 0.0, "fill_threshold": 0.0, "rule": OccupancyRule.paper(), "soft": False,
-                 "edge_range": (0.01, 0.1), "strategy": "importance", "visibility_kind": "rays"}  # fmt: skip
+        known = {
+            "threshold": 0.0,
+            "fill_threshold": 0.0,
+            "rule": OccupancyRule.paper(),
+            "soft": False,
+            "edge_range": (0.01, 0.1),
+            "strategy": "importance",
+            "visibility_kind": "rays",
+        }
         return cls(**{**known, **overrides})
 
 

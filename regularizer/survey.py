@@ -70,10 +70,20 @@ class _Asker:
 
 
 def survey_field(
-    query: Query, aabb: NDArray[np.float64], pitch: float, shape: tuple[int, int, int], *, rule: OccupancyRule,
-    faint: float, opaque_pitch: float, soft: bool, keep_boxes: tuple[Any, ...], probe: int, drop_invalid: bool,
+    query: Query,
+    aabb: NDArray[np.float64],
+    pitch: float,
+    shape: tuple[int, int, int],
+    *,
+    rule: OccupancyRule,
+    faint: float,
+    opaque_pitch: float,
+    soft: bool,
+    keep_boxes: tuple[Any, ...],
+    probe: int,
+    drop_invalid: bool,
     rows: int,
-) -> Survey:  # fmt: skip
+) -> Survey:
     """Ask the field where there may be something, slab by slab (along x), keeping a float32 and three bits a cell.
 
     Args:

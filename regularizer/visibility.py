@@ -98,9 +98,14 @@ class ViewCounter:
     """
 
     def __init__(
-        self, cameras: Cameras, *, min_views: int = 1, aabb: ArrayLike | None = None,
-        depth_maps: NDArray[Any] | None = None, tolerance: float = 0.05,
-    ) -> None:  # fmt: skip
+        self,
+        cameras: Cameras,
+        *,
+        min_views: int = 1,
+        aabb: ArrayLike | None = None,
+        depth_maps: NDArray[Any] | None = None,
+        tolerance: float = 0.05,
+    ) -> None:
         if min_views < 1:
             raise ValueError(f"ViewCounter: min_views must be >= 1, got {min_views}")
         shape = (len(cameras), cameras.height, cameras.width)

@@ -55,6 +55,8 @@ def measure_speed(denoiser: Any, *, batch: int = 40, seconds: float = 5.0, seed:
             break
     median = statistics.median(durations[WARM_UP:])
     return {
-        "cubes_per_second": batch / median, "milliseconds": 1000 * median,
-        "calls": len(durations) - WARM_UP, "batch": batch,
-    }  # fmt: skip
+        "cubes_per_second": batch / median,
+        "milliseconds": 1000 * median,
+        "calls": len(durations) - WARM_UP,
+        "batch": batch,
+    }

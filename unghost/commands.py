@@ -42,8 +42,10 @@ def bench(
 
     model = load_denoiser(denoiser, backend="onnx", threads=threads or None)
     row = measure_speed(model, batch=batch, seconds=seconds)
-    print(f"{row['cubes_per_second']:.0f} cubes/s ({model.precision}, batch {batch}, median of {row['calls']} calls, "
-          f"{row['milliseconds']:.1f} ms each)")  # fmt: skip
+    print(
+        f"{row['cubes_per_second']:.0f} cubes/s ({model.precision}, batch {batch}, median of {row['calls']} calls, "
+        f"{row['milliseconds']:.1f} ms each)"
+    )
     if out is not None:
         about = {"precision": model.precision, "parameters": model.manifest.parameters}
         rows = [{"method": model.manifest.name, **row, "threads": threads, **about}]

@@ -12,9 +12,15 @@ from tyro.conf import Positional, arg
 def capture(
     train: Positional[Annotated[Path, arg(metavar="TRAIN")]],
     evaluation: Positional[Annotated[Path, arg(metavar="EVALUATION")]],
-    out: Path, frames: int = 100, one_lens: bool = False,
-    longest_side: int = 1600, minimum_share: float = 0.5, seed: int = 0, threads: int = 0, plot: Path | None = None,
-) -> None:  # fmt: skip
+    out: Path,
+    frames: int = 100,
+    one_lens: bool = False,
+    longest_side: int = 1600,
+    minimum_share: float = 0.5,
+    seed: int = 0,
+    threads: int = 0,
+    plot: Path | None = None,
+) -> None:
     """Make a capture from two videos (or two folders of photos): one to train on, one to be scored on.
 
     The sharpest frames are kept, both sweeps are posed together by COLMAP (on the CPU; 2 x 100 frames take half an
@@ -69,10 +75,16 @@ def capture(
 
 def convert(
     capture: Positional[Annotated[Path, arg(metavar="CAPTURE")]],
-    out: Path | None = None, train_split: str | None = None, eval_split: str | None = None, every: int | None = None,
-    splits: Path | None = None, photos: Path | None = None, missing: Literal["error", "drop"] = "error",
-    link: bool = False, plot: Path | None = None,
-) -> None:  # fmt: skip
+    out: Path | None = None,
+    train_split: str | None = None,
+    eval_split: str | None = None,
+    every: int | None = None,
+    splits: Path | None = None,
+    photos: Path | None = None,
+    missing: Literal["error", "drop"] = "error",
+    link: bool = False,
+    plot: Path | None = None,
+) -> None:
     """Say how hard a capture's evaluation is and, with --out, write it as stock nerfstudio reads it.
 
     Reads transforms.json folders (the released Nerfbusters captures with their frame_1_... names too) and COLMAP

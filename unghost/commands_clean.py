@@ -97,9 +97,11 @@ def _judging(denoiser: str, threads: int, strength: float, cameras: Path | None)
     from .evaluation.captures import load_cameras
 
     return {
-        "denoiser": load_denoiser(denoiser, backend="onnx", threads=threads or None), "strength": strength,
-        "cameras": None if cameras is None else load_cameras(cameras), "progress": _windows(),
-    }  # fmt: skip
+        "denoiser": load_denoiser(denoiser, backend="onnx", threads=threads or None),
+        "strength": strength,
+        "cameras": None if cameras is None else load_cameras(cameras),
+        "progress": _windows(),
+    }
 
 
 def _check_distinct(**files: Path | None) -> None:

@@ -11,10 +11,18 @@ KIND = "uncertainty"
 
 
 def doubt(
-    renders: Positional[Path], gt: Path, train_renders: Path, eval_split: str | None = None,
-    train_split: str | None = None, downscale: float = 1.0, depth_along: Literal["ray", "axis"] = "ray",
-    normalize: bool = True, tolerance: float = 0.05, slack: float = 0.0, replace: bool = False,
-) -> None:  # fmt: skip
+    renders: Positional[Path],
+    gt: Path,
+    train_renders: Path,
+    eval_split: str | None = None,
+    train_split: str | None = None,
+    downscale: float = 1.0,
+    depth_along: Literal["ray", "axis"] = "ray",
+    normalize: bool = True,
+    tolerance: float = 0.05,
+    slack: float = 0.0,
+    replace: bool = False,
+) -> None:
     """Say which pixels not to trust, by the photos that were trained on; needs renders with depth, but no field.
 
     Writes RENDERS/uncertainty, a .npy a view (0: the photos that see the point have its colour; 1: none sees it) and a
@@ -55,16 +63,24 @@ def doubt(
     if depth_along == "axis":
         depth, photo_depth = ray_depth(depth, cameras), ray_depth(photo_depth, photo_cameras)
     found = photo_doubt(
-        method.renders.colours, depth, cameras, photos=capture.images(taught), photo_depth=photo_depth,
-        photo_cameras=photo_cameras, tolerance=tolerance, slack=slack,
-    )  # fmt: skip
+        method.renders.colours,
+        depth,
+        cameras,
+        photos=capture.images(taught),
+        photo_depth=photo_depth,
+        photo_cameras=photo_cameras,
+        tolerance=tolerance,
+        slack=slack,
+    )
     short = [Path(name).name for name in names]
     for name, values in zip(short if len(set(short)) == len(short) else names, found):
         _write((renders / KIND / name).with_suffix(".npy"), values)
     seen = found[found < UNSEEN]
     median = f"; a doubt of {np.median(seen):.3f} in the median where one does" if seen.size else ""
-    print(f"{len(names)} views, {len(photo_names)} photos: {seen.size / found.size:.3f} of the pixels show what one of "
-          f"them sees{median}\n{renders / KIND}")  # fmt: skip
+    print(
+        f"{len(names)} views, {len(photo_names)} photos: {seen.size / found.size:.3f} of the pixels show what one of "
+        f"them sees{median}\n{renders / KIND}"
+    )
 
 
 def _there(depth: Any, folder: Path) -> Any:

@@ -24,13 +24,27 @@ CAPTION_KEYS = ("psnr", "ssim", "coverage")
 
 
 def evaluate(
-    renders: Positional[tuple[str, ...]], gt: Path, out: Path = Path("out/evaluate"), against: tuple[str, ...] = (),
-    masks: Path | None = None, convention: str | None = None, metrics: tuple[str, ...] = (),
-    lpips: Literal["none", "alex", "vgg", "squeeze"] = "none", downscale: float = 1.0, eval_split: str | None = None,
-    train_split: str | None = None, normalize: bool = True, depth_along: Literal["ray", "axis"] = "ray",
-    occlusion: bool | None = None, min_views: int = 1, sort: str | None = None, pairs: int = 12,
-    side_by_side: bool = True, resamples: int = 1000, seed: int = 0,
-) -> None:  # fmt: skip
+    renders: Positional[tuple[str, ...]],
+    gt: Path,
+    out: Path = Path("out/evaluate"),
+    against: tuple[str, ...] = (),
+    masks: Path | None = None,
+    convention: str | None = None,
+    metrics: tuple[str, ...] = (),
+    lpips: Literal["none", "alex", "vgg", "squeeze"] = "none",
+    downscale: float = 1.0,
+    eval_split: str | None = None,
+    train_split: str | None = None,
+    normalize: bool = True,
+    depth_along: Literal["ray", "axis"] = "ray",
+    occlusion: bool | None = None,
+    min_views: int = 1,
+    sort: str | None = None,
+    pairs: int = 12,
+    side_by_side: bool = True,
+    resamples: int = 1000,
+    seed: int = 0,
+) -> None:
     """Score anyone's renders against photos: a page, a results file, a table. No field is needed.
 
     Args:
@@ -77,9 +91,17 @@ def evaluate(
         references = [methods[0].name]
     print(f"{len(methods)} method{'s' * (len(methods) > 1)}, {len(scene.truth)} views, convention {name}", flush=True)
     found = compare_methods(
-        methods, scene.truth, scene.extent, np.random.default_rng(seed), convention=name, references=references,
-        network=network, keys=metrics or None, resamples=resamples, side_by_side=side_by_side,
-    )  # fmt: skip
+        methods,
+        scene.truth,
+        scene.extent,
+        np.random.default_rng(seed),
+        convention=name,
+        references=references,
+        network=network,
+        keys=metrics or None,
+        resamples=resamples,
+        side_by_side=side_by_side,
+    )
     notes = [*scene.notes, *_not_proper(convention, name, methods, scene), *unavailable]
     details = _details(gt, scene, found["rows"], references, name, key) | {"notes": notes}
     command = shlex.join(["unghost", *sys.argv[1:]])
@@ -151,17 +173,23 @@ def _methods(folders: Mapping[str, Path], scene: _Scene, depth_along: str) -> li
     if scene.cameras is None:
         raise ValueError("evaluate: depth-along axis needs the cameras: masks.npz, or a capture as gt")
     return [
-        each if each.renders.depth is None else replace(
-            each, renders=replace(each.renders, depth=ray_depth(each.renders.depth, scene.cameras))
-        )
+        each
+        if each.renders.depth is None
+        else replace(each, renders=replace(each.renders, depth=ray_depth(each.renders.depth, scene.cameras)))
         for each in methods
-    ]  # fmt: skip
+    ]
 
 
 def _scene(
-    gt: Path, masks: Path | None, downscale: float, eval_split: str | None, train_split: str | None,
-    normalize: bool, occlusion: bool | None, min_views: int,
-) -> _Scene:  # fmt: skip
+    gt: Path,
+    masks: Path | None,
+    downscale: float,
+    eval_split: str | None,
+    train_split: str | None,
+    normalize: bool,
+    occlusion: bool | None,
+    min_views: int,
+) -> _Scene:
     from .evaluation.colmap import find_model
     from .evaluation.conventions import SceneExtent
     from .evaluation.pseudo import check_cameras, load_pseudo_truth
@@ -206,9 +234,13 @@ def _scene(
 
 
 def _capture(
-    folder: Path, views: Sequence[str] | None, downscale: float, eval_split: str | None, train_split: str | None,
+    folder: Path,
+    views: Sequence[str] | None,
+    downscale: float,
+    eval_split: str | None,
+    train_split: str | None,
     normalize: bool,
-) -> tuple[tuple[str, ...], Any, Cameras, Cameras | None]:  # fmt: skip
+) -> tuple[tuple[str, ...], Any, Cameras, Cameras | None]:
     import numpy as np
 
     from .evaluation.captures import load_capture
@@ -268,11 +300,18 @@ def _details(
         known = [key for key in images[0] if any(isinstance(each[key], float) for each in images)]
         raise ValueError(f"evaluate: no view of {main['method']} has a {sort} to sort by, but {', '.join(known)}")
     return {
-        "convention": convention, "views": len(photos), "width": photos.shape[2], "height": photos.shape[1],
-        "gt": gt.resolve().name, "sort": sort, "sorted_by": main["method"], "references": list(references),
+        "convention": convention,
+        "views": len(photos),
+        "width": photos.shape[2],
+        "height": photos.shape[1],
+        "gt": gt.resolve().name,
+        "sort": sort,
+        "sorted_by": main["method"],
+        "references": list(references),
         "wipe": [references[0], main["method"]] if references else [main["method"], PHOTO],
-        "extent": None if extent is None else {"limit": extent.limit, "unit": extent.unit}, **scene.told,
-    }  # fmt: skip
+        "extent": None if extent is None else {"limit": extent.limit, "unit": extent.unit},
+        **scene.told,
+    }
 
 
 def _write(out: Path, results: Mapping[str, Any], methods: Sequence[Method], scene: _Scene, pairs: int) -> None:

@@ -28,10 +28,18 @@ def _depth_maps(path: Path, key: str) -> Any:
 
 
 def masks(
-    capture: Positional[Path], depth: Path, out: Path, eval_split: str = "eval", train_split: str = "train",
-    train_depth: Path | None = None, tolerance: float = 0.05, min_views: int = 1, downscale: float = 8.0,
-    depth_along: Literal["ray", "axis"] = "ray", normalize: bool = True,
-) -> None:  # fmt: skip
+    capture: Positional[Path],
+    depth: Path,
+    out: Path,
+    eval_split: str = "eval",
+    train_split: str = "train",
+    train_depth: Path | None = None,
+    tolerance: float = 0.05,
+    min_views: int = 1,
+    downscale: float = 8.0,
+    depth_along: Literal["ray", "axis"] = "ray",
+    normalize: bool = True,
+) -> None:
     """Visibility masks of the two-trajectory protocol, from depth and cameras alone.
 
     Args:

@@ -150,16 +150,29 @@ def train(
 
     keep_freed_memory()
     given: dict[str, Any] = {
-        "name": name, "steps": steps, "max_seconds": max_seconds, "batch_size": batch_size, "seed": seed,
-        "learning_rate": learning_rate, "precision": precision, "device": device, "threads": threads,
-        "threshold_from": threshold_from, "init_from": init_from, "drop_channels": drop_channels,
-    }  # fmt: skip
+        "name": name,
+        "steps": steps,
+        "max_seconds": max_seconds,
+        "batch_size": batch_size,
+        "seed": seed,
+        "learning_rate": learning_rate,
+        "precision": precision,
+        "device": device,
+        "threads": threads,
+        "threshold_from": threshold_from,
+        "init_from": init_from,
+        "drop_channels": drop_channels,
+    }
     chosen = _configured(config, size, channels, given)
     result = run(
-        chosen, train_shards=[pair for spec in shards for pair in expand_shards(spec)],
-        validation_shards=_named_shards(validation), out=out, resume=resume, progress=True,
+        chosen,
+        train_shards=[pair for spec in shards for pair in expand_shards(spec)],
+        validation_shards=_named_shards(validation),
+        out=out,
+        resume=resume,
+        progress=True,
         online=_online(online, seed=chosen.seed, workers=online_workers, mesh_root=mesh_root),
-    )  # fmt: skip
+    )
     if os.environ.get("RANK", "0") != "0":
         return  # one process of torchrun speaks for all
     print(f"{result.steps} steps in {result.seconds:.0f} s, ended by {result.reason}; model: {result.model}")
@@ -168,9 +181,13 @@ def train(
 
 
 def export(
-    checkpoint: Positional[Path], out: Path | None = None, precision: tuple[Literal["fp32", "fp16", "int8"], ...] = (),
-    calibration: str = "procedural", calibration_cubes: int = 96, seed: int = 0,
-) -> None:  # fmt: skip
+    checkpoint: Positional[Path],
+    out: Path | None = None,
+    precision: tuple[Literal["fp32", "fp16", "int8"], ...] = (),
+    calibration: str = "procedural",
+    calibration_cubes: int = 96,
+    seed: int = 0,
+) -> None:
     """Write a trained prior as portable ONNX files, compared with torch before they appear.
 
     Args:
@@ -225,9 +242,11 @@ def verify(
 
     onnx, checkpoint = onnx or WEIGHTS / "default.onnx", checkpoint or WEIGHTS / "default.safetensors"
     report = run(onnx, checkpoint, cubes=cubes, seed=seed)
-    print(f"{report['precision']}: max error {report['max_error']:.2e}, mean {report['mean_error']:.2e}, "
-          f"occupancy flips {report['flip_rate']:.2e} of the voxels of {report['cubes']} cubes: "
-          f"{'passed' if report['passed'] else 'FAILED'}")  # fmt: skip
+    print(
+        f"{report['precision']}: max error {report['max_error']:.2e}, mean {report['mean_error']:.2e}, "
+        f"occupancy flips {report['flip_rate']:.2e} of the voxels of {report['cubes']} cubes: "
+        f"{'passed' if report['passed'] else 'FAILED'}"
+    )
     if out is not None:
         write_results(out, build_results([{"method": "onnx", **report}], seeds=[seed]))
     return 0 if report["passed"] else 1

@@ -12,10 +12,15 @@ from tyro.conf import Positional, arg
 
 
 def curate(
-    recipe: Positional[str], out: Path, count: Annotated[int, arg(aliases=["-n", "--n"])] = 20_000, seed: int = 0,
-    workers: int = 1, mesh_root: Path | None = None, engine: Literal["local", "ray"] = "local",
+    recipe: Positional[str],
+    out: Path,
+    count: Annotated[int, arg(aliases=["-n", "--n"])] = 20_000,
+    seed: int = 0,
+    workers: int = 1,
+    mesh_root: Path | None = None,
+    engine: Literal["local", "ray"] = "local",
     shard_length: int = 8192,
-) -> None:  # fmt: skip
+) -> None:
     """Make training pairs from a recipe: cubes of procedural solids, booleans or meshes, and their corruptions.
 
     Args:
@@ -34,16 +39,31 @@ def curate(
     from .data_recipes.recipe import load_recipe
 
     shards = make(
-        load_recipe(recipe), out, count=count, seed=seed, workers=workers, mesh_root=mesh_root, engine=engine,
-        shard_length=shard_length, progress=True, log=print,
-    )  # fmt: skip
+        load_recipe(recipe),
+        out,
+        count=count,
+        seed=seed,
+        workers=workers,
+        mesh_root=mesh_root,
+        engine=engine,
+        shard_length=shard_length,
+        progress=True,
+        log=print,
+    )
     print(f"{count} pairs in {len(shards)} shard{'s' if len(shards) > 1 else ''} under {out}")
 
 
 def harvest(
-    out: Path, scenes: int = 16, seed: int = 0, first: int = 0, workers: int = 1, fit: bool = True,
-    cubes: int | None = None, kinds: tuple[str, ...] = (), mesh_root: Path | None = None,
-) -> None:  # fmt: skip
+    out: Path,
+    scenes: int = 16,
+    seed: int = 0,
+    first: int = 0,
+    workers: int = 1,
+    fit: bool = True,
+    cubes: int | None = None,
+    kinds: tuple[str, ...] = (),
+    mesh_root: Path | None = None,
+) -> None:
     """Fit radiance fields to few photos of synthetic scenes; cut out cubes beside the truth.
 
     Every cube comes with its surroundings, its frame, and how many photos saw each voxel.
@@ -69,9 +89,17 @@ def harvest(
         given["kinds"], given["shares"] = zip(*map(_named_share, kinds))
     config = HarvestConfig(**given)
     pairs = make(
-        out, scenes=scenes, seed=seed, first=first, workers=workers, config=config, fit=fit, mesh_root=mesh_root,
-        progress=True, log=print,
-    )  # fmt: skip
+        out,
+        scenes=scenes,
+        seed=seed,
+        first=first,
+        workers=workers,
+        config=config,
+        fit=fit,
+        mesh_root=mesh_root,
+        progress=True,
+        log=print,
+    )
     print(f"{pairs} pairs under {out}")
 
 
@@ -99,8 +127,10 @@ def preview(
     from .data_recipes.preview import write_preview
 
     page, facts = write_preview(folder, out=out, cubes=cubes, seed=seed, against=against)
-    print(f"{facts['total']} cubes in {facts['shards']} shard{'s' if facts['shards'] > 1 else ''}, "
-          f"IoU of input and truth {facts['iou']['mean']:.3f}; look at {page}")  # fmt: skip
+    print(
+        f"{facts['total']} cubes in {facts['shards']} shard{'s' if facts['shards'] > 1 else ''}, "
+        f"IoU of input and truth {facts['iou']['mean']:.3f}; look at {page}"
+    )
     if against is not None:
         found = facts["against"]
         chance = "" if found["floor"] is None else f" (two halves of one set: {found['floor']:.3f})"

@@ -55,14 +55,24 @@ def sample(
     calls = steps * -(-count // max(batch_size, 1))
     with tqdm(total=calls, unit="step", dynamic_ncols=True) as bar:
         cubes = sample_cubes(
-            denoiser.network, count=count, edge_fraction=edge_fraction, seed=seed, steps=steps, eta=eta,
-            batch_size=batch_size, on_step=lambda step, x0: bar.update(),
-        )  # fmt: skip
+            denoiser.network,
+            count=count,
+            edge_fraction=edge_fraction,
+            seed=seed,
+            steps=steps,
+            eta=eta,
+            batch_size=batch_size,
+            on_step=lambda step, x0: bar.update(),
+        )
     signed = cubes[:, 0].numpy()
     facts = {
-        "seed": seed, "steps": steps, "eta": eta, "edge_fraction": edge_fraction,
-        "objective": denoiser.network.config.objective, "model": denoiser.manifest.name,
-    }  # fmt: skip
+        "seed": seed,
+        "steps": steps,
+        "eta": eta,
+        "edge_fraction": edge_fraction,
+        "objective": denoiser.network.config.objective,
+        "model": denoiser.manifest.name,
+    }
     write_samples(out, signed, facts)
     share = float((signed > 0).mean())
     print(f"{count} cubes, {share:.1%} of the voxels occupied; look at {out / 'sheet.png'}")

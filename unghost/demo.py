@@ -120,9 +120,12 @@ def run_demo(out: str | Path, *, seed: int = 0, denoiser: Any = None) -> dict[st
     rows = [{"method": name, **score(room, item.kept), "seconds": item.seconds} for name, item in outcomes.items()]
     pictures = draw_pictures(room, {name: item.kept for name, item in outcomes.items()})
     results = build_results(
-        rows, command=f"unghost demo --seed {seed}", seeds=[seed], seconds=time.perf_counter() - start,
+        rows,
+        command=f"unghost demo --seed {seed}",
+        seeds=[seed],
+        seconds=time.perf_counter() - start,
         weights={"name": denoiser.manifest.name, "body_sha256": denoiser.manifest.body_sha256},
-    )  # fmt: skip
+    )
     folder.mkdir(parents=True, exist_ok=True)
     for name, png in pictures.items():
         (folder / f"{name}.png").write_bytes(png)

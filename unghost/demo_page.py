@@ -69,12 +69,15 @@ def _table(heads: list[str], rows: list[list[str]]) -> str:
 
 def _wipe(before: bytes, after: bytes) -> str:
     return (
-        '<div class="wipe">' + _image(after, "The room after cleaning")
-        + '<div class="top">' + _image(before, "The same room full of ghosts") + "</div>"
+        '<div class="wipe">'
+        + _image(after, "The room after cleaning")
+        + '<div class="top">'
+        + _image(before, "The same room full of ghosts")
+        + "</div>"
         + '<input type="range" min="0" max="100" value="50" aria-label="Before and after" '
         "oninput=\"this.parentNode.style.setProperty('--at', this.value + '%')\">"
         + '<div class="bar"></div><em style="left:12px">before</em><em style="right:12px">after</em></div>'
-    )  # fmt: skip
+    )
 
 
 def page_text(results: Mapping[str, Any], pictures: Mapping[str, bytes]) -> str:

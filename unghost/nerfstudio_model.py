@@ -55,9 +55,12 @@ def cameras_of(cameras: Any) -> Cameras:
     lens = np.stack([getattr(cameras, name).reshape(-1).double().cpu().numpy() for name in ("fx", "fy", "cx", "cy")], 1)
     bend = cameras.distortion_params
     return Cameras.create(
-        cameras.camera_to_worlds.double().cpu().numpy(), lens * scale, int(width[0]), int(height[0]),
+        cameras.camera_to_worlds.double().cpu().numpy(),
+        lens * scale,
+        int(width[0]),
+        int(height[0]),
         None if bend is None else bend.double().cpu().numpy(),
-    )  # fmt: skip
+    )
 
 
 class UnghostNerfactoModel(NerfactoModel):  # type: ignore[misc]
@@ -97,9 +100,13 @@ class UnghostNerfactoModel(NerfactoModel):  # type: ignore[misc]
         if denoiser.kind == "torch":
             denoiser = denoiser.to(self.device)
         self.regularizer = DensityRegularizer(
-            denoiser, aabb=self.scene_box.aabb.cpu().numpy(), cameras=cameras_of(cameras), cubes=c.unghost_cubes,
-            dsds_weight=c.unghost_dsds_weight, visibility_weight=c.unghost_visibility_weight,
-        )  # fmt: skip
+            denoiser,
+            aabb=self.scene_box.aabb.cpu().numpy(),
+            cameras=cameras_of(cameras),
+            cubes=c.unghost_cubes,
+            dsds_weight=c.unghost_dsds_weight,
+            visibility_weight=c.unghost_visibility_weight,
+        )
 
     def density_fields(self) -> list[Any]:
         """The field's density and each proposal network's, once."""

@@ -69,8 +69,10 @@ def preview_png(mask: KeepMask, occupied: NDArray[np.bool_]) -> bytes:
 def region_table(mask: KeepMask) -> str:
     """The removed regions as lines of text, largest first."""
     summary = mask.summary()
-    lines = [f"{summary.get('region_count', 0)} regions would go, {summary.get('removed', 0)} of "
-             f"{summary.get('occupied', 0)} occupied cells"]  # fmt: skip
+    lines = [
+        f"{summary.get('region_count', 0)} regions would go, {summary.get('removed', 0)} of "
+        f"{summary.get('occupied', 0)} occupied cells"
+    ]
     regions = summary.get("regions", [])[:MOST_ROWS]
     if regions:
         lines.append(f"{'cells':>9} {'volume':>10} {'confidence':>10}  box (scene units)")

@@ -43,9 +43,11 @@ def test_opacity_by_hand():
 
 
 @given(
-    density=st.floats(0, 1e6), pitch=st.floats(1e-4, 1e2), unit=st.floats(1e-3, 1e3),
+    density=st.floats(0, 1e6),
+    pitch=st.floats(1e-4, 1e2),
+    unit=st.floats(1e-3, 1e3),
     threshold=st.floats(0.01, 0.99),
-)  # fmt: skip
+)
 def test_the_opacity_rule_does_not_depend_on_the_unit(density, pitch, unit, threshold):
     rule = OccupancyRule("opacity", threshold)
     here = float(opacity_from_density(np.float64(density), pitch))

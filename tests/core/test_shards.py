@@ -38,9 +38,12 @@ def test_golden_bytes(shard):
     )
     manifest = json.loads((shard / "manifest.json").read_text(encoding="utf-8"))
     assert manifest == {
-        "format": "unghost-shard", "format_version": 1, "count": 2, "sha256": GOLDEN,
+        "format": "unghost-shard",
+        "format_version": 1,
+        "count": 2,
+        "sha256": GOLDEN,
         "provenance": {"recipe": "test", "seed": 3},
-    }  # fmt: skip
+    }
 
 
 def test_round_trip_is_memory_mapped(shard, arrays):

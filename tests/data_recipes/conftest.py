@@ -29,7 +29,10 @@ def _gltf(**changes):
     """A unit square in two triangles (a strip) as a glTF tree; ``changes`` replace its parts."""
     data = _CORNERS.tobytes() + _STRIP.tobytes()
     tree = {
-        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
         "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1, "mode": 5}]}],
         "accessors": [
             {"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3"},
@@ -37,7 +40,7 @@ def _gltf(**changes):
         ],
         "bufferViews": [{"buffer": 0, "byteLength": len(data)}],
         "buffers": [{"byteLength": len(data), "uri": "data:;base64," + base64.b64encode(data).decode()}],
-    }  # fmt: skip
+    }
     return {**tree, **changes}
 
 
@@ -69,8 +72,11 @@ def _glb():
 
 _BINARY_PLY = (
     _TRIANGLE_PLY.split("end_header")[0].replace("ascii", "binary_little_endian").encode()
-    + b"end_header\n" + _CORNERS[:3].tobytes() + b"\3" + np.array([0, 1, 2], dtype="<i4").tobytes()
-)  # fmt: skip
+    + b"end_header\n"
+    + _CORNERS[:3].tobytes()
+    + b"\3"
+    + np.array([0, 1, 2], dtype="<i4").tobytes()
+)
 _VALID = {
     "off": ("off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"),
     "ply": ("ply", _TRIANGLE_PLY.encode()),
@@ -88,9 +94,16 @@ _VALID = {
 def samples():
     """Small sound mesh files, some made to order; ``valid`` has one of each kind, its ending and its bytes."""
     return SimpleNamespace(
-        square_obj=_SQUARE_OBJ, triangle_ply=_TRIANGLE_PLY, facet=_FACET, corners=_CORNERS, strip=_STRIP,
-        gltf=_gltf, accessor=_accessor, dae=_dae, valid=_VALID,
-    )  # fmt: skip
+        square_obj=_SQUARE_OBJ,
+        triangle_ply=_TRIANGLE_PLY,
+        facet=_FACET,
+        corners=_CORNERS,
+        strip=_STRIP,
+        gltf=_gltf,
+        accessor=_accessor,
+        dae=_dae,
+        valid=_VALID,
+    )
 
 
 @pytest.fixture(scope="session")

@@ -50,8 +50,19 @@ def test_empty_and_full_cubes_survive(name):
     ALL[name](rng, np.ones_like(SHELL), 1.0)
 
 
-@pytest.mark.parametrize("name", ["detached_blobs", "fog_sheets", "fog_volumes", "touching_floaters", "streaks",
-                                  "blocks", "doubled_surface", "swollen_surface"])  # fmt: skip
+@pytest.mark.parametrize(
+    "name",
+    [
+        "detached_blobs",
+        "fog_sheets",
+        "fog_volumes",
+        "touching_floaters",
+        "streaks",
+        "blocks",
+        "doubled_surface",
+        "swollen_surface",
+    ],
+)
 def test_ghosts_only_add(name):
     assert (CORRUPTIONS[name](np.random.default_rng(1), SHELL, 1.0) >= SHELL).all()
 

@@ -13,9 +13,11 @@ def soup(seed, count, spread):
 
 @settings(max_examples=60, deadline=None)
 @given(
-    seed=st.integers(0, 2**31), count=st.sampled_from([1, 2, 15, 16, 17, 256, 257, 700]),
-    spread=st.sampled_from([0.0, 1e-3, 0.1, 2.0]), edge=st.sampled_from([0.0, 1e-3, 0.1, 3.0]),
-)  # fmt: skip
+    seed=st.integers(0, 2**31),
+    count=st.sampled_from([1, 2, 15, 16, 17, 256, 257, 700]),
+    spread=st.sampled_from([0.0, 1e-3, 0.1, 2.0]),
+    edge=st.sampled_from([0.0, 1e-3, 0.1, 3.0]),
+)
 def test_finds_every_box_that_touches_and_hardly_another(seed, count, spread, edge):
     triangles = soup(seed, count, spread)
     lows = np.random.default_rng(seed + 1).uniform(-1, 1, size=(9, 3))

@@ -191,8 +191,18 @@ def test_shares_of_one_and_zero():
         empty, _, frame = sample_cube(np.random.default_rng(i), dataclasses.replace(RECIPE, empty_share=1.0))
         assert not empty.any()
         assert frame is None
-    wall = dataclasses.replace(RECIPE, families=("ball",), parts=(1, 1), empty_share=0.0, on_share=1.0, near_share=0.0,
-                               max_dilation=0, hollow_share=0.0, bumpy_share=0.0, center_jitter=0.0)  # fmt: skip
+    wall = dataclasses.replace(
+        RECIPE,
+        families=("ball",),
+        parts=(1, 1),
+        empty_share=0.0,
+        on_share=1.0,
+        near_share=0.0,
+        max_dilation=0,
+        hollow_share=0.0,
+        bumpy_share=0.0,
+        center_jitter=0.0,
+    )
     for i in range(10):
         thin, _, _ = sample_cube(np.random.default_rng(i), dataclasses.replace(wall, solid_share=0.0))
         full, _, _ = sample_cube(np.random.default_rng(i), dataclasses.replace(wall, solid_share=1.0))

@@ -68,8 +68,9 @@ def test_edges_are_log_uniform_and_rotations_uniform(ball):
     frames = [choose_frame(rng, ball, RECIPE) for rng in generators(1500)]
     logs = np.log([f.edge_length for f in frames])
     low, high = np.log(RECIPE.edge_fraction)
-    np.testing.assert_allclose((np.quantile(logs, [0, 0.25, 0.5, 0.75, 1]) - low) / (high - low),
-                               [0, 0.25, 0.5, 0.75, 1], atol=0.04)  # fmt: skip
+    np.testing.assert_allclose(
+        (np.quantile(logs, [0, 0.25, 0.5, 0.75, 1]) - low) / (high - low), [0, 0.25, 0.5, 0.75, 1], atol=0.04
+    )
     axes = np.stack([f.rotation for f in frames])
     np.testing.assert_allclose(axes.mean(axis=0), 0, atol=0.05)
     np.testing.assert_allclose((axes**2).mean(axis=0), 1 / 3, atol=0.03)

@@ -99,8 +99,9 @@ def test_a_mesh_whose_name_no_other_system_has_is_passed_over(tmp_path, mesh_roo
     add_row(mesh_root, "a:b.ply,train,CC0-1.0")
     heard = []
     folders = curate(mesh_recipe, tmp_path / "out", count=12, seed=0, mesh_root=mesh_root, log=heard.append)
-    assert heard == ["a:b.ply was passed over: rejected: its path holds a character that is no part of a name on "
-                     "every system"]  # fmt: skip
+    assert heard == [
+        "a:b.ply was passed over: rejected: its path holds a character that is no part of a name on every system"
+    ]
     assert set(read_shard(folders[0]).group.tolist()) == {0, 2}
 
 

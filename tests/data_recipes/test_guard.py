@@ -51,12 +51,19 @@ def folder(tmp_path):
 def test_a_bad_mesh_costs_itself(folder):
     outcomes = list(read_folder(folder))
     assert [(o.path.as_posix(), o.status) for o in outcomes] == [
-        ("a.obj", "loaded"), ("b.obj", "rejected"), ("c.obj", "empty"), ("deep/d.ply", "rejected"),
+        ("a.obj", "loaded"),
+        ("b.obj", "rejected"),
+        ("c.obj", "empty"),
+        ("deep/d.ply", "rejected"),
         ("deep/e.OBJ", "loaded"),
-    ]  # fmt: skip
+    ]
     assert [o.reason for o in outcomes] == [
-        "", "54 coordinates of corners are not finite", "no triangles", "no PLY header", "",
-    ]  # fmt: skip
+        "",
+        "54 coordinates of corners are not finite",
+        "no triangles",
+        "no PLY header",
+        "",
+    ]
     assert [o.mesh is None for o in outcomes] == [False, True, True, True, False]
 
 
@@ -153,11 +160,15 @@ def test_nobody_is_called(folder):
         server.settimeout(0.2)
         url = f"http://127.0.0.1:{server.getsockname()[1]}/a.bin"
         tree = {
-            "asset": {"version": "2.0"}, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}], "images": [{"uri": url}],
-            "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}], "buffers": [{"byteLength": 36, "uri": url}],
+            "asset": {"version": "2.0"},
+            "scenes": [{"nodes": [0]}],
+            "nodes": [{"mesh": 0}],
+            "images": [{"uri": url}],
+            "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+            "buffers": [{"byteLength": 36, "uri": url}],
             "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}],
             "bufferViews": [{"buffer": 0, "byteLength": 36}],
-        }  # fmt: skip
+        }
         (folder / "a.gltf").write_text(json.dumps(tree))
         (outcome,) = read_folder(folder, ["a.gltf"])
         assert outcome.status == "rejected"
@@ -199,9 +210,13 @@ def test_the_fence(tmp_path):
     )
     path = os.pathsep.join(p or os.getcwd() for p in sys.path)
     run = subprocess.run(
-        [sys.executable, "-B", "-c", code, json.dumps(REFUSED + ALLOWED)], capture_output=True, text=True, check=True,
-        cwd=tmp_path, env={**os.environ, "PYTHONPATH": path},
-    )  # fmt: skip
+        [sys.executable, "-B", "-c", code, json.dumps(REFUSED + ALLOWED)],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": path},
+    )
     ends = json.loads(run.stdout)
     for attempt, end in zip(REFUSED, ends, strict=False):
         assert "is forbidden while a mesh file is read" in str(end), attempt

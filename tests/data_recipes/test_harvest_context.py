@@ -38,9 +38,7 @@ def test_surroundings_see_a_surface_between_their_centres():
 
     # three edges are 0.32: voxels of 0.02. Their centres (.01, .03, ..) miss the sheet from .02 to .028; of the two
     # layers of points in the voxel from .02 to .04, at .025 and .035, one lies in it.
-    coarse = surroundings(
-        sheet, np.zeros((1, 3)), np.array([0.32 / 3]), np.eye(3)[None], np.array([0.02]), AABB
-    )  # fmt: skip
+    coarse = surroundings(sheet, np.zeros((1, 3)), np.array([0.32 / 3]), np.eye(3)[None], np.array([0.02]), AABB)
     opacity = opacity_from_signed(coarse)[0]
     np.testing.assert_allclose(opacity[9], 0.5, atol=1e-6)
     assert not np.delete(opacity, 9, axis=0).any()

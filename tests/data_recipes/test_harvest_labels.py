@@ -66,18 +66,20 @@ def test_labels_by_hand(photographed):
     truth = Truth(photographed, AABB)
     ball = np.array([0.2, 0.3, -0.1])
     toward = np.array([0.7, 0.0, 0.5]) / np.linalg.norm([0.7, 0.0, 0.5])
-    positions = np.stack([
-        ball + 0.3 * toward,  # the skin that the cameras see
-        ball + np.array([-0.3, 0.0, 0.0]),  # the skin that they do not
-        ball,  # deep inside
-        ball + 0.24 * toward,  # three cells behind the skin that they see
-        ball + np.array([-0.24, 0.0, 0.0]),  # three cells behind the skin that they do not
-        ball + 0.32 * toward,  # one cell out: the band between
-        ball + 0.5 * toward,  # air before the cameras
-        np.array([0.0, 0.0, 0.9]),  # air that nobody looks at
-        np.array([-0.5, 0.75, -0.2]),  # air behind the ball, hidden by it
-        np.array([0.0, 0.0, 1.1]),  # air outside the box
-    ]).reshape(2, 5, 3)  # fmt: skip
+    positions = np.stack(
+        [
+            ball + 0.3 * toward,  # the skin that the cameras see
+            ball + np.array([-0.3, 0.0, 0.0]),  # the skin that they do not
+            ball,  # deep inside
+            ball + 0.24 * toward,  # three cells behind the skin that they see
+            ball + np.array([-0.24, 0.0, 0.0]),  # three cells behind the skin that they do not
+            ball + 0.32 * toward,  # one cell out: the band between
+            ball + 0.5 * toward,  # air before the cameras
+            np.array([0.0, 0.0, 0.9]),  # air that nobody looks at
+            np.array([-0.5, 0.75, -0.2]),  # air behind the ball, hidden by it
+            np.array([0.0, 0.0, 1.1]),  # air outside the box
+        ]
+    ).reshape(2, 5, 3)
     opaque, light = np.ones((2, 5), dtype=bool), np.zeros((2, 5), dtype=bool)
     seen, ignored, free = SURFACE_LABEL, IGNORE_LABEL, FREE_LABEL
     expected = np.array([[seen, ignored, ignored, seen, ignored], [ignored, free, ignored, ignored, ignored]])

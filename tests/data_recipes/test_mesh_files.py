@@ -148,14 +148,16 @@ def test_sound_files_without_triangles_are_empty(written, suffix, content):
 @pytest.mark.parametrize(
     "changed",
     [
-        lambda text: text.replace("\n", "\r"), lambda text: text.replace("\n", "\r\n"),
-        lambda text: text.encode("utf-16"), lambda text: b"\xef\xbb\xbf" + text.encode(),
+        lambda text: text.replace("\n", "\r"),
+        lambda text: text.replace("\n", "\r\n"),
+        lambda text: text.encode("utf-16"),
+        lambda text: b"\xef\xbb\xbf" + text.encode(),
         lambda text: text.replace("f 1 2 ", "f 1/7/ \\\n 2//3 "),
         lambda text: text.replace("f 1 2 3 4", "f -4 -3 -2 -1"),
         lambda text: "# caf\xe9\n".encode("latin-1") + text.encode(),
         lambda text: "v 1e9 0 0\n" + text.replace("f 1 2 3 4", "f 2 3 4 5"),
     ],
-)  # fmt: skip
+)
 def test_odd_but_sound_obj_files_are_the_same_square(written, samples, changed, area):
     read = read_mesh_file(written(changed(samples.square_obj), "obj"))
     assert read.extent == 2

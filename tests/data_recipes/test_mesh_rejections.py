@@ -58,31 +58,64 @@ REJECTED = [
     ("gltf", lambda s: s.gltf(nodes=[{"mesh": 0, "matrix": [1] * 15}]), "16 finite numbers"),
     ("gltf", lambda s: s.gltf(nodes=[{"mesh": 0, "rotation": [0, 0, 0, 2]}]), "no unit quaternion"),
     ("gltf", lambda s: s.gltf(nodes=[{"mesh": 1}]), "mesh must be a whole number below 1"),
-    ("gltf", lambda s: s.gltf(extensionsRequired=["KHR_draco_mesh_compression"]),
-     "KHR_draco_mesh_compression is not read"),
-    ("gltf", lambda s: s.gltf(meshes=[{"primitives": [{"attributes": {"POSITION": 0}, "mode": 4,
-                                           "extensions": {"KHR_draco_mesh_compression": {}}}]}]), "compressed with"),
-    ("gltf", lambda s: s.gltf(meshes=[{"primitives": [{"attributes": {"POSITION": 0}, "mode": 6}]}]),
-     "fans are not read"),
-    ("gltf", lambda s: s.gltf(meshes=[{"primitives": [{"attributes": {"POSITION": 0}}]}]),
-     "4 corners do not make triangles"),
+    (
+        "gltf",
+        lambda s: s.gltf(extensionsRequired=["KHR_draco_mesh_compression"]),
+        "KHR_draco_mesh_compression is not read",
+    ),
+    (
+        "gltf",
+        lambda s: s.gltf(
+            meshes=[
+                {
+                    "primitives": [
+                        {"attributes": {"POSITION": 0}, "mode": 4, "extensions": {"KHR_draco_mesh_compression": {}}}
+                    ]
+                }
+            ]
+        ),
+        "compressed with",
+    ),
+    (
+        "gltf",
+        lambda s: s.gltf(meshes=[{"primitives": [{"attributes": {"POSITION": 0}, "mode": 6}]}]),
+        "fans are not read",
+    ),
+    (
+        "gltf",
+        lambda s: s.gltf(meshes=[{"primitives": [{"attributes": {"POSITION": 0}}]}]),
+        "4 corners do not make triangles",
+    ),
     ("gltf", lambda s: s.gltf(accessors=s.accessor(sparse={})), "sparse"),
     ("gltf", lambda s: s.gltf(accessors=s.accessor(count=5)), "beyond its buffer view"),
     ("gltf", lambda s: s.gltf(accessors=s.accessor(componentType=5122)), "is VEC3 of 5122"),
-    ("gltf", lambda s: s.gltf(accessors=s.accessor(componentType=5122, normalized=True),
-                              extensionsUsed=["KHR_mesh_quantization"]),
-     "normalised whole numbers"),
-    ("gltf", lambda s: s.gltf(accessors=[{"componentType": 5126, "count": 4, "type": "VEC3"}, s.accessor()[1]]),
-     "no data"),
-    ("gltf", lambda s: s.gltf(accessors=[s.accessor()[0], {**s.accessor()[1], "byteOffset": 12}]),
-     "name vertices that are not among"),
+    (
+        "gltf",
+        lambda s: s.gltf(
+            accessors=s.accessor(componentType=5122, normalized=True), extensionsUsed=["KHR_mesh_quantization"]
+        ),
+        "normalised whole numbers",
+    ),
+    (
+        "gltf",
+        lambda s: s.gltf(accessors=[{"componentType": 5126, "count": 4, "type": "VEC3"}, s.accessor()[1]]),
+        "no data",
+    ),
+    (
+        "gltf",
+        lambda s: s.gltf(accessors=[s.accessor()[0], {**s.accessor()[1], "byteOffset": 12}]),
+        "name vertices that are not among",
+    ),
     ("gltf", lambda s: s.gltf(buffers=[{"byteLength": 56, "uri": "absent.bin"}]), "which is not there"),
     ("gltf", lambda s: s.gltf(buffers=[{"byteLength": 56, "uri": "http://127.0.0.1:9/a.bin"}]), "no relative path"),
     ("gltf", lambda s: s.gltf(buffers=[{"byteLength": 56, "uri": "/etc/passwd"}]), "no relative path"),
     ("gltf", lambda s: s.gltf(buffers=[{"byteLength": 56, "uri": "../../a.bin"}]), "outside the folder"),
     ("gltf", lambda s: s.gltf(buffers=[{"byteLength": 56, "uri": "%2e%2e/a.bin"}]), "outside the folder"),
-    ("gltf", lambda s: s.gltf(buffers=[{"byteLength": 57, "uri": s.gltf()["buffers"][0]["uri"]}]),
-     "announces 57 bytes and has 56"),
+    (
+        "gltf",
+        lambda s: s.gltf(buffers=[{"byteLength": 57, "uri": s.gltf()["buffers"][0]["uri"]}]),
+        "announces 57 bytes and has 56",
+    ),
     ("gltf", lambda s: s.gltf(asset={"version": "1.0"}), "glTF version 1.0"),
     ("gltf", lambda s: s.gltf(nodes=[{"mesh": 0, "name": 42}]), "name of text"),
     ("gltf", '{"asset": {"version": "2.0"}, "scene": NaN}', "NaN is no JSON number"),
@@ -93,15 +126,18 @@ REJECTED = [
     ("dae", lambda s: s.dae(before="<!DOCTYPE a [<!ENTITY b 'c'>]>").encode("utf-16"), "document type declaration"),
     ("dae", lambda s: s.dae()[:-30], "cut short or broken"),
     ("dae", "<a>" * 300, "nested deeper"),
-    ("dae", lambda s: s.dae(nodes="<node><instance_geometry url='#other'/></node>"),
-     "which is no geometry of this file"),
+    (
+        "dae",
+        lambda s: s.dae(nodes="<node><instance_geometry url='#other'/></node>"),
+        "which is no geometry of this file",
+    ),
     ("dae", lambda s: s.dae(nodes="<node><instance_controller url='#g'/></node>"), "skinned or morphed"),
     ("dae", lambda s: s.dae(nodes="<node id='n'><instance_node url='#n'/></node>"), "in a cycle"),
     ("dae", lambda s: s.dae(polygons="<vcount>4</vcount><p>0 1 3</p>"), "disagree"),
     ("step", "ISO-10303-21;", "the format 'step' is not read; known: .*, obj, off, ply"),
     ("", "v 0 0 0\n", "the format '' is not read"),
     ("glb", b"PK\3\4" + b"\0" * 60, "no GLB header"),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("suffix", "content", "reason"), REJECTED, ids=[f"{r[0]}:{r[2][:24]}" for r in REJECTED])

@@ -135,8 +135,10 @@ def test_missing_trimesh_names_the_extra(tmp_path):
 
 
 def test_only_the_allowed_licences_split_and_formats(mesh_root):
-    names = {split: [entry.path.name for entry in select_meshes(dataclasses.replace(RECIPE, split=split), mesh_root)]
-             for split in ("train", "val", "test")}  # fmt: skip
+    names = {
+        split: [entry.path.name for entry in select_meshes(dataclasses.replace(RECIPE, split=split), mesh_root)]
+        for split in ("train", "val", "test")
+    }
     assert names == {"train": ["box0.ply", "box3.ply"], "val": ["box2.ply"], "test": ["box4.ply"]}
     assert [entry.row for entry in select_meshes(RECIPE, mesh_root)] == [0, 3]
 
@@ -185,8 +187,10 @@ def test_samples_share_meshes_in_runs_and_every_mesh_has_its_turn(mesh_root):
 @pytest.mark.shared_data
 def test_splits_of_the_real_manifest_are_disjoint_and_free():
     root = SHARED / "meshes"
-    rows = [{entry.row for entry in select_meshes(dataclasses.replace(RECIPE, split=split), root)}
-            for split in ("train", "val", "test")]  # fmt: skip
+    rows = [
+        {entry.row for entry in select_meshes(dataclasses.replace(RECIPE, split=split), root)}
+        for split in ("train", "val", "test")
+    ]
     assert all(rows)
     assert sum(map(len, rows)) == len(set().union(*rows))
 

@@ -88,8 +88,17 @@ def test_the_page_holds_everything_and_asks_no_network(pairs, tmp_path):
     assert facts["total"] == facts["cubes"] == 9
     assert facts["shards"] == 1
     said = " ".join(page.said)
-    for words in ("9 pairs of cubes", "empty inputs", "empty truths", "Edge fraction", "Occupied share", "procedural",
-                  "generated", "Sources and licences", "ghost share"):  # fmt: skip
+    for words in (
+        "9 pairs of cubes",
+        "empty inputs",
+        "empty truths",
+        "Edge fraction",
+        "Occupied share",
+        "procedural",
+        "generated",
+        "Sources and licences",
+        "ghost share",
+    ):
         assert words in said, words
     assert page.tags["svg"] == 6
 
@@ -180,8 +189,15 @@ def test_sources_from_each_kind_of_provenance(tmp_path):
     }
     assert sources_of(shard_of(tmp_path / "c", signed, labels, {})) == {("unknown", "unknown"): 3}
     entries = [{"path": "kit/a.glb", "licence": "CC0-1.0"}, {"path": "kit/b.glb", "licence": "CC0-1.0"}]
-    each = Shard(stated.inputs, stated.labels, stated.severity, stated.edge_fraction, stated.group,
-                 {"recipe": recipe, "sources": entries}, source=np.array([0, 1, -1], dtype=np.int32))  # fmt: skip
+    each = Shard(
+        stated.inputs,
+        stated.labels,
+        stated.severity,
+        stated.edge_fraction,
+        stated.group,
+        {"recipe": recipe, "sources": entries},
+        source=np.array([0, 1, -1], dtype=np.int32),
+    )
     assert sources_of(each) == {("mine: kit", "CC0-1.0"): 2, ("mine", "generated"): 1}
 
 

@@ -30,10 +30,12 @@ def test_range_type_repeatability_and_unchanged_arguments():
 
 
 def test_it_is_soft():
-    values = np.concatenate([
-        soften(np.random.default_rng(seed), SHELL, corrupt(np.random.default_rng(seed), SHELL, 0.8), 0.8).ravel()
-        for seed in range(20)
-    ])  # fmt: skip
+    values = np.concatenate(
+        [
+            soften(np.random.default_rng(seed), SHELL, corrupt(np.random.default_rng(seed), SHELL, 0.8), 0.8).ravel()
+            for seed in range(20)
+        ]
+    )
     assert ((values > -0.9) & (values < 0.9)).mean() > 0.15
 
 

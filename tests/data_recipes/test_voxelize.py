@@ -9,9 +9,12 @@ from unghost.data_recipes.voxelize import voxelize_batch, voxelize_triangles, vo
 
 @settings(max_examples=150, deadline=None)
 @given(
-    seed=st.integers(0, 2**31), resolution=st.integers(1, 20), count=st.integers(0, 4),
-    reach=st.sampled_from([0.01, 0.2, 1.0, 6.0]), kind=st.sampled_from(["plain", "needle", "point", "upright", "line"]),
-)  # fmt: skip
+    seed=st.integers(0, 2**31),
+    resolution=st.integers(1, 20),
+    count=st.integers(0, 4),
+    reach=st.sampled_from([0.01, 0.2, 1.0, 6.0]),
+    kind=st.sampled_from(["plain", "needle", "point", "upright", "line"]),
+)
 def test_equals_the_thirteen_axes_voxel_by_voxel(seed, resolution, count, reach, kind):
     rng = np.random.default_rng(seed)
     triangles = rng.normal(size=(count, 1, 3)) * 0.3 + rng.normal(size=(count, 3, 3)) * reach
@@ -30,9 +33,12 @@ def test_equals_the_thirteen_axes_voxel_by_voxel(seed, resolution, count, reach,
 
 @settings(max_examples=150, deadline=None)
 @given(
-    seed=st.integers(0, 2**31), resolution=st.sampled_from([1, 2, 8, 16]), count=st.integers(1, 4),
-    step=st.sampled_from([2, 8, 16, 32]), reach=st.integers(1, 3),
-)  # fmt: skip
+    seed=st.integers(0, 2**31),
+    resolution=st.sampled_from([1, 2, 8, 16]),
+    count=st.integers(1, 4),
+    step=st.sampled_from([2, 8, 16, 32]),
+    reach=st.integers(1, 3),
+)
 def test_ties_on_faces_edges_and_corners_of_voxels_are_exact(seed, resolution, count, step, reach):
     """Corners on a lattice that voxel faces and centres lie on: touching is everywhere, and always counts."""
     triangles = np.random.default_rng(seed).integers(-reach * step, reach * step + 1, size=(count, 3, 3)) / (2 * step)

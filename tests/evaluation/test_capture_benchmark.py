@@ -57,10 +57,17 @@ def capture(tmp_path):
 
 def _options(bench, capture, tmp_path, **changes):
     given = {
-        "train": "one", "eval": "two", "seeds": (0, 1), "downscale": 2, "steps": 3, "finetune_steps": 2,
-        "resolution": 16, "settings": ("cubes=1", "visibility_samples=64"), "out": tmp_path / "out",
+        "train": "one",
+        "eval": "two",
+        "seeds": (0, 1),
+        "downscale": 2,
+        "steps": 3,
+        "finetune_steps": 2,
+        "resolution": 16,
+        "settings": ("cubes=1", "visibility_samples=64"),
+        "out": tmp_path / "out",
         "cache": tmp_path / "cache",
-    }  # fmt: skip
+    }
     return bench.Options(capture=capture, **{**given, **changes})
 
 

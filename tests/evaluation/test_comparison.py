@@ -55,8 +55,12 @@ def test_common_pixels_and_equal_coverage_by_hand():
     at_quarter = next(each for each in rows["whole"]["curve"] if each["coverage"] == pytest.approx(0.25))
     upper = truth.visible[0] & (np.arange(SIZE[0]) < 8)[:, None]
     every = np.broadcast_to(upper, (3, *SIZE))
-    pooled = metrics.psnr(whole.renders.colours[every][None], truth.photos[every][None],
-                          np.ones((1, every.sum()), dtype=bool), data_range=1.0)  # fmt: skip
+    pooled = metrics.psnr(
+        whole.renders.colours[every][None],
+        truth.photos[every][None],
+        np.ones((1, every.sum()), dtype=bool),
+        data_range=1.0,
+    )
     assert at_quarter["psnr"] == pytest.approx(pooled)
     assert len(rows["whole"]["curve"]) == 10
     assert "curve" not in rows["less"]

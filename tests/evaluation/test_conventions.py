@@ -20,9 +20,14 @@ def _cameras(origins):
 
 def test_every_published_convention_is_there_and_frozen():
     assert set(CONVENTIONS) == {
-        "proper", "paper_text", "paper_code", "bayes_rays_masked", "bayes_rays_unmasked", "free_space_prior",
+        "proper",
+        "paper_text",
+        "paper_code",
+        "bayes_rays_masked",
+        "bayes_rays_unmasked",
+        "free_space_prior",
         "nerfbaselines",
-    }  # fmt: skip
+    }
     with pytest.raises(dataclasses.FrozenInstanceError):
         CONVENTIONS["proper"].visible = False
     with pytest.raises(TypeError):
@@ -98,10 +103,14 @@ def test_masks_by_hand():
     renders, truth = Renders(colours, depth, accumulation), Truth(colours, visible)
     extent = SceneExtent(limit=8.0, unit=2.0)
     wanted = {
-        "proper": [1, 1, 0, 0], "paper_text": [1, 1, 0, 0], "nerfbaselines": [1, 1, 0, 0],
-        "paper_code": [1, 0, 0, 0], "bayes_rays_masked": [1, 0, 0, 0], "bayes_rays_unmasked": [1, 0, 0, 0],
+        "proper": [1, 1, 0, 0],
+        "paper_text": [1, 1, 0, 0],
+        "nerfbaselines": [1, 1, 0, 0],
+        "paper_code": [1, 0, 0, 0],
+        "bayes_rays_masked": [1, 0, 0, 0],
+        "bayes_rays_unmasked": [1, 0, 0, 0],
         "free_space_prior": [0, 1, 1, 1],
-    }  # fmt: skip
+    }
     for name, each in CONVENTIONS.items():
         masks = conventions.evaluation_masks(each, renders, truth, extent)
         assert masks[0, 0].astype(int).tolist() == wanted[name], name

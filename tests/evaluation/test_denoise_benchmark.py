@@ -31,9 +31,15 @@ def parts():
         import denoise_speed
 
         yield {
-            "classical": classical, "scores": denoise_scores, "sets": denoise_sets, "figure": denoise_figure,
-            "capture": capture_cubes, "denoise": denoise, "speed": denoise_speed, "study": channels_study,
-        }  # fmt: skip
+            "classical": classical,
+            "scores": denoise_scores,
+            "sets": denoise_sets,
+            "figure": denoise_figure,
+            "capture": capture_cubes,
+            "denoise": denoise,
+            "speed": denoise_speed,
+            "study": channels_study,
+        }
     finally:
         sys.path.remove(str(BENCHMARKS))
 
@@ -131,9 +137,14 @@ def test_the_front_is_what_nothing_beats_in_both(parts):
 
 def test_blind_is_the_same_cubes_and_nothing_about_them(parts):
     cubes = parts["sets"].CubeSet(
-        "harvest", {}, signed(plate())[None], np.zeros((1, 32, 32, 32), np.uint8), np.full(1, 0.1, np.float32),
-        np.zeros(1, np.int32), view_count=np.ones((1, 32, 32, 32), np.uint8),
-    )  # fmt: skip
+        "harvest",
+        {},
+        signed(plate())[None],
+        np.zeros((1, 32, 32, 32), np.uint8),
+        np.full(1, 0.1, np.float32),
+        np.zeros(1, np.int32),
+        view_count=np.ones((1, 32, 32, 32), np.uint8),
+    )
     blind = parts["sets"].blind(cubes)
     assert parts["sets"].tells_more(cubes)
     assert not parts["sets"].tells_more(blind)
@@ -148,10 +159,13 @@ def test_the_figure_times_a_way_to_use_a_model_by_its_model(parts, tmp_path):
     rows += [
         {"method": method, "set": "harvest", "ghosts_removed_98": value, **about}
         for method, value, about in (
-            ("input", 0.0, {}), ("median", 0.1, {}), ("m", 0.3, {"model": "m"}), ("m, blind", 0.2, {"model": "m"}),
+            ("input", 0.0, {}),
+            ("median", 0.1, {}),
+            ("m", 0.3, {"model": "m"}),
+            ("m, blind", 0.2, {"model": "m"}),
             ("m+noise@50", 0.1, {"model": "m"}),
         )
-    ]  # fmt: skip
+    ]
     drawn = {}
 
     class Spy(Figure):
@@ -177,9 +191,13 @@ def test_the_figure_times_a_way_to_use_a_model_by_its_model(parts, tmp_path):
 
 def test_damage_repeats_and_grows(parts):
     clean = parts["sets"].CubeSet(
-        "clean", {}, signed(plate())[None], np.where(plate(), SURFACE_LABEL, FREE_LABEL).astype(np.uint8)[None],
-        np.full(1, 0.1, np.float32), np.zeros(1, np.int32),
-    )  # fmt: skip
+        "clean",
+        {},
+        signed(plate())[None],
+        np.where(plate(), SURFACE_LABEL, FREE_LABEL).astype(np.uint8)[None],
+        np.full(1, 0.1, np.float32),
+        np.zeros(1, np.int32),
+    )
     low, again, high = (parts["sets"].damaged(clean, "salt", severity) for severity in (0.1, 0.1, 1.0))
     np.testing.assert_array_equal(low.signed, again.signed)
     changed = [(cubes.signed != clean.signed).sum() for cubes in (low, high)]
@@ -228,8 +246,10 @@ def test_a_diffusion_is_asked_in_more_ways_than_a_restoration(parts):
     ways = parts["denoise"].variants_of
     assert [way[0] for way in ways("r", Model("restoration"), (10, 200))] == ["r"]
     assert [(way[0], way[2]) for way in ways("d", Model("diffusion"), (10, 200))] == [
-        ("d", 50), ("d@10", 10), ("d@200", 200),
-    ]  # fmt: skip
+        ("d", 50),
+        ("d@10", 10),
+        ("d@200", 200),
+    ]
 
 
 def test_the_study_shows_bits_where_it_says_so_and_keeps_the_truth(parts, tmp_path):
@@ -241,9 +261,11 @@ def test_the_study_shows_bits_where_it_says_so_and_keeps_the_truth(parts, tmp_pa
     arrays = {
         "inputs": rng.integers(0, 256, (3, 32, 32, 32), dtype=np.uint8),
         "labels": pack_labels(rng.integers(0, 3, (3, 32, 32, 32)).astype(np.uint8)),
-        "severity": np.float32([0.1, 0.2, 0.3]), "edge_fraction": np.full(3, 0.1, np.float32),
-        "group": np.arange(3, dtype=np.int32), "view_count": rng.integers(0, 9, (3, 32, 32, 32), dtype=np.uint8),
-    }  # fmt: skip
+        "severity": np.float32([0.1, 0.2, 0.3]),
+        "edge_fraction": np.full(3, 0.1, np.float32),
+        "group": np.arange(3, dtype=np.int32),
+        "view_count": rng.integers(0, 9, (3, 32, 32, 32), dtype=np.uint8),
+    }
     write_shard(tmp_path / "shard", arrays, {"recipe": "harvest"})
     study = parts["study"]
     ((path, weight),) = study.bit_shards([(str(tmp_path / "shard"), 0.5)], tmp_path / "bits")
@@ -283,9 +305,13 @@ def test_bubbles_are_whole_ghosts_clear_of_the_surface(parts):
 
     truth = np.stack([plate(), np.ones((32, 32, 32), bool)])
     clean = parts["sets"].CubeSet(
-        "clean", {}, signed(truth), np.where(truth, SURFACE_LABEL, FREE_LABEL).astype(np.uint8),
-        np.full(2, 0.1, np.float32), np.arange(2, dtype=np.int32),
-    )  # fmt: skip
+        "clean",
+        {},
+        signed(truth),
+        np.where(truth, SURFACE_LABEL, FREE_LABEL).astype(np.uint8),
+        np.full(2, 0.1, np.float32),
+        np.arange(2, dtype=np.int32),
+    )
     bits, soft = parts["sets"].bubble_sets(clean)
     bubbles = (bits.signed > 0) & ~truth
     assert 1 <= label(bubbles[0])[1] <= 3

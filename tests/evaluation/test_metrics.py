@@ -68,9 +68,15 @@ def test_what_is_masked_out_is_never_looked_at():
 def test_ssim_map_is_scikit_images(data_range):
     preds, target = (image * data_range for image in _pair())
     _, oracle = structural_similarity(
-        preds, target, gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
-        data_range=data_range, channel_axis=-1, full=True,
-    )  # fmt: skip
+        preds,
+        target,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=data_range,
+        channel_axis=-1,
+        full=True,
+    )
     np.testing.assert_allclose(metrics.ssim_map(preds, target, data_range=data_range), oracle.mean(axis=-1), atol=1e-10)
     assert metrics.ssim(preds, target, FULL, data_range=data_range) == pytest.approx(oracle.mean())
 

@@ -32,8 +32,13 @@ def images(seed=0):
 
 
 def dataset(photo, mask=None, root="there/gt-color"):
-    return {"images": [photo], "masks": None if mask is None else [mask], "image_paths": [NAME],
-            "image_paths_root": str(root), "metadata": {"color_space": "srgb"}}  # fmt: skip
+    return {
+        "images": [photo],
+        "masks": None if mask is None else [mask],
+        "image_paths": [NAME],
+        "image_paths_root": str(root),
+        "metadata": {"color_space": "srgb"},
+    }
 
 
 def half():
@@ -134,8 +139,13 @@ def test_what_it_cannot_score_is_refused(tmp_path, monkeypatch):
 
 def test_every_protocol_has_a_name_and_is_registered():
     names = [each().get_name() for each in PROTOCOLS]
-    assert names == ["unghost-whole-image", "unghost-visible-only", "unghost-proper", "unghost-paper-text",
-                     "unghost-paper-code"]  # fmt: skip
+    assert names == [
+        "unghost-whole-image",
+        "unghost-visible-only",
+        "unghost-proper",
+        "unghost-paper-text",
+        "unghost-paper-code",
+    ]
     spec = Path(nerfbaselines_protocol.__file__).with_name("nerfbaselines_spec.py").read_text(encoding="utf-8")
     registered = re.findall(r'"(\w+)"', re.search(r"in \((.*?)\):", spec).group(1))
     assert registered == [each.__name__ for each in PROTOCOLS]

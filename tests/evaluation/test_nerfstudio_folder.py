@@ -77,8 +77,9 @@ def test_a_released_capture_becomes_one_that_stock_nerfstudio_splits(tmp_path, l
         assert len(origins) == 4
     again = whole(out)
     assert {name: [again.names[k] for k in found] for name, found in again.splits.items()} == {
-        "train": [NAMES[0], NAMES[2]], "eval": [NAMES[1], NAMES[3]],
-    }  # fmt: skip
+        "train": [NAMES[0], NAMES[2]],
+        "eval": [NAMES[1], NAMES[3]],
+    }
     np.testing.assert_array_equal(again.images([again.names.index(NAMES[3])])[0, 0, 0] * 255, [3, 0, 0])
     assert (out / NAMES[0]).is_symlink() == (photos == "link")
 

@@ -45,12 +45,27 @@ def read(text):
 def rows():
     image = {"name": "v0", "pixels": 9, "psnr": 20.0, "coverage": 0.9, "infinite": []}
     return [
-        {"method": "a", "convention": "proper", "psnr": 20.0, "coverage": 0.9, "intervals": {"psnr": [19.0, 21.0]},
-         "images": 2, "images_scored": 2, "per_image": [image, {**image, "name": "v1", "psnr": 22.0}],
-         "curve": [{"coverage": 0.5, "psnr": 23.0}, {"coverage": 0.9, "psnr": 20.0}]},
-        {"method": "b", "convention": "proper", "psnr": 18.0, "coverage": 1.0, "images": 2, "images_scored": 1,
-         "per_image": [image, {**image, "name": "v1", "psnr": None}]},
-    ]  # fmt: skip
+        {
+            "method": "a",
+            "convention": "proper",
+            "psnr": 20.0,
+            "coverage": 0.9,
+            "intervals": {"psnr": [19.0, 21.0]},
+            "images": 2,
+            "images_scored": 2,
+            "per_image": [image, {**image, "name": "v1", "psnr": 22.0}],
+            "curve": [{"coverage": 0.5, "psnr": 23.0}, {"coverage": 0.9, "psnr": 20.0}],
+        },
+        {
+            "method": "b",
+            "convention": "proper",
+            "psnr": 18.0,
+            "coverage": 1.0,
+            "images": 2,
+            "images_scored": 1,
+            "per_image": [image, {**image, "name": "v1", "psnr": None}],
+        },
+    ]
 
 
 def test_the_page_is_one_file_that_nests_and_fetches_nothing():
@@ -76,14 +91,26 @@ def test_hostile_names_are_text_everywhere():
     shown = {"photo": picture} | {row["method"]: picture for row in found}
     errors = {row["method"]: picture for row in found}
     view = ViewPictures("v0" + HOSTILE, shown, errors, dict.fromkeys(errors, HOSTILE), True)
-    difference = {"method": HOSTILE, "against": HOSTILE, "convention": "proper", "metric": HOSTILE, "difference": 1.0,
-                  "low": 0.5, "high": 2.0, "images": 2}  # fmt: skip
+    difference = {
+        "method": HOSTILE,
+        "against": HOSTILE,
+        "convention": "proper",
+        "metric": HOSTILE,
+        "difference": 1.0,
+        "low": 0.5,
+        "high": 2.0,
+        "images": 2,
+    }
     results = {
-        "rows": found, "command": HOSTILE, "commit": HOSTILE, "versions": {HOSTILE: HOSTILE},
-        "machine": {"cores": HOSTILE, "architecture": HOSTILE}, "differences": [difference],
+        "rows": found,
+        "command": HOSTILE,
+        "commit": HOSTILE,
+        "versions": {HOSTILE: HOSTILE},
+        "machine": {"cores": HOSTILE, "architecture": HOSTILE},
+        "differences": [difference],
         "conventions": {HOSTILE: [{"metric": HOSTILE, HOSTILE: 1.0, "spread": None}]},
         "evaluation": {"views": 2, "width": 4, "height": 4, "gt": HOSTILE, "masks": HOSTILE, "notes": [HOSTILE]},
-    }  # fmt: skip
+    }
     reader = read(page.page_text(results, [view]))
     assert [tag for tag, _ in reader.tags].count("script") == 1  # the page's own
     assert not [attributes for _, attributes in reader.tags if "onerror" in attributes]
@@ -92,8 +119,10 @@ def test_hostile_names_are_text_everywhere():
 
 
 def test_lpips_on_two_backbones_is_two_columns_that_name_them():
-    found = [{"method": name, "convention": "proper", "lpips": value, "lpips_backbone": name}
-             for name, value in (("vgg", 0.5), ("alex", 0.25))]  # fmt: skip
+    found = [
+        {"method": name, "convention": "proper", "lpips": value, "lpips_backbone": name}
+        for name, value in (("vgg", 0.5), ("alex", 0.25))
+    ]
     text = score_table(found, ["lpips"])
     assert re.findall(r"LPIPS \((\w+)\)", text) == ["vgg", "alex"]
     assert re.findall(r"<td>(.*?)</td>", text) == ["0.500", "–", "–", "0.250"]
@@ -113,12 +142,24 @@ def test_two_conventions_are_two_tables_and_one_table_refuses_both():
 
 def test_results_of_other_programs_make_a_page_too():
     made = [
-        {"method": name, "scene": scene, "seed": seed, "convention": convention, "psnr": 17.0 + seed, "ssim": None,
-         "coverage": 0.8, "curve": [{"coverage": 0.4, "psnr": 18.0 + seed, "threshold": 0.5},
-                                    {"coverage": 0.8, "psnr": 17.0 + seed, "threshold": 0.1}]}
-        for name in ("ours", "theirs") for scene in ("room", "hall") for seed in (0, 1)
+        {
+            "method": name,
+            "scene": scene,
+            "seed": seed,
+            "convention": convention,
+            "psnr": 17.0 + seed,
+            "ssim": None,
+            "coverage": 0.8,
+            "curve": [
+                {"coverage": 0.4, "psnr": 18.0 + seed, "threshold": 0.5},
+                {"coverage": 0.8, "psnr": 17.0 + seed, "threshold": 0.1},
+            ],
+        }
+        for name in ("ours", "theirs")
+        for scene in ("room", "hall")
+        for seed in (0, 1)
         for convention in ("proper", "paper_code")
-    ]  # fmt: skip
+    ]
     mean = {"method": "ours", "scene": "mean", "convention": "proper", "psnr": 17.5, "coverage": 0.8, "per_seed": [{}]}
     reader = read(page.page_text({"rows": [*made, mean]}))
     tags = [tag for tag, _ in reader.tags]
@@ -143,17 +184,25 @@ def test_numbers_and_what_stands_for_none():
 
 def test_a_difference_is_called_so_only_if_its_interval_leaves_out_zero():
     row = {"method": "a", "against": "b", "convention": "c", "images": 3}
-    cases = [("psnr", 1.0, 0.5, 1.5, "better"), ("flip", 1.0, 0.5, 1.5, "worse"),
-             ("psnr", 1.0, -0.5, 2.5, "no difference"),
-             ("coverage", -0.1, -0.2, -0.05, "differs"), ("psnr", 1.0, None, None, "one image")]  # fmt: skip
+    cases = [
+        ("psnr", 1.0, 0.5, 1.5, "better"),
+        ("flip", 1.0, 0.5, 1.5, "worse"),
+        ("psnr", 1.0, -0.5, 2.5, "no difference"),
+        ("coverage", -0.1, -0.2, -0.05, "differs"),
+        ("psnr", 1.0, None, None, "one image"),
+    ]
     for metric, mean, low, high, verdict in cases:
         text = page_tables.difference_table([{**row, "metric": metric, "difference": mean, "low": low, "high": high}])
         assert f">{verdict}" in text, (metric, verdict)
 
 
 def test_the_worst_come_first_and_the_undefined_last():
-    images = [{"name": "a", "psnr": 20.0, "flip": 0.1}, {"name": "b", "psnr": None, "infinite": ["psnr"], "flip": 0.0},
-              {"name": "c", "psnr": 10.0, "flip": 0.3}, {"name": "d", "psnr": None, "flip": None}]  # fmt: skip
+    images = [
+        {"name": "a", "psnr": 20.0, "flip": 0.1},
+        {"name": "b", "psnr": None, "infinite": ["psnr"], "flip": 0.0},
+        {"name": "c", "psnr": 10.0, "flip": 0.3},
+        {"name": "d", "psnr": None, "flip": None},
+    ]
     assert worst_first(images, "psnr") == ["c", "a", "b", "d"]
     assert worst_first(images, "flip") == ["c", "a", "b", "d"]
     with pytest.raises(ValueError, match=r"key must be one of psnr, ssim, .* got 'coverage'"):

@@ -22,6 +22,9 @@ def test_pooled_scores_are_those_of_all_pixels_at_once():
 def test_pooled_scores_by_hand():
     images = ({"pixels": 30, "psnr": 10.0, "ssim": 0.5}, {"pixels": 10, "psnr": 20.0, "ssim": None}, {"pixels": 0})
     found = SceneScores("proper", images, {}).pooled(("psnr", "ssim", "disparity_mae"))
-    assert found == {"psnr": pytest.approx(-10 * np.log10((0.1 * 30 + 0.01 * 10) / 40)), "ssim": 0.5,
-                     "disparity_mae": None}  # fmt: skip
+    assert found == {
+        "psnr": pytest.approx(-10 * np.log10((0.1 * 30 + 0.01 * 10) / 40)),
+        "ssim": 0.5,
+        "disparity_mae": None,
+    }
     assert SceneScores("proper", ({"pixels": 3, "psnr": np.inf},), {}).pooled(("psnr",)) == {"psnr": np.inf}

@@ -36,9 +36,12 @@ def posed(room, tmp_path_factory):
     true = np.concatenate([rig.camera_to_world for rig in rigs.values()])
     told = []
     posing = pose_jointly(
-        folder / "images", sweeps, out=folder / "sparse" / "0", settings=PosingSettings(threads=1),
+        folder / "images",
+        sweeps,
+        out=folder / "sparse" / "0",
+        settings=PosingSettings(threads=1),
         progress=lambda *step: told.append(step),
-    )  # fmt: skip
+    )
     return folder, sweeps, true, posing, told
 
 

@@ -116,9 +116,18 @@ def test_scores_are_means_over_views_of_the_metrics():
     errors = [np.mean((0.1 * pseudo[i][masks[i]]) ** 2) for i in range(2)]
     assert found["depth_mse"] == pytest.approx(np.mean(errors))
     wanted = {
-        "psnr", "ssim", "depth_mse", "disparity_mae", "normal_mean_deg", "normal_median_deg", "normal_pct_30",
-        "coverage", "convention", "psnr_visible", "views_scored",
-    }  # fmt: skip
+        "psnr",
+        "ssim",
+        "depth_mse",
+        "disparity_mae",
+        "normal_mean_deg",
+        "normal_median_deg",
+        "normal_pct_30",
+        "coverage",
+        "convention",
+        "psnr_visible",
+        "views_scored",
+    }
     assert set(found) == wanted
 
 

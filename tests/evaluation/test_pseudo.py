@@ -141,18 +141,28 @@ def test_the_file_can_be_read_from_its_description(tmp_path):
             arrays[name.removesuffix(".npy")] = np.lib.format.read_array(io.BytesIO(raw), allow_pickle=False)
     manifest = json.loads(arrays.pop("manifest").tobytes().decode("utf-8"))
     assert {key: manifest[key] for key in manifest if key != "sha256"} == {
-        "format": "unghost-pseudo-gt", "format_version": 1, "names": ["a", "b"], "eval_size": [20, 16],
-        "train_size": [20, 16], "depth_limit": 6.0, "tolerance": 0.05, "details": {"scene": "wall"},
-    }  # fmt: skip
+        "format": "unghost-pseudo-gt",
+        "format_version": 1,
+        "names": ["a", "b"],
+        "eval_size": [20, 16],
+        "train_size": [20, 16],
+        "depth_limit": 6.0,
+        "tolerance": 0.05,
+        "details": {"scene": "wall"},
+    }
     types = {name: (values.dtype.str, values.shape) for name, values in arrays.items()}
     assert types == {
-        "depth": ("<f4", (2, 16, 20)), "normals": ("<f4", (2, 16, 20, 3)),
-        "seen_frustum": ("<u2", (2, 16, 20)), "seen_open": ("<u2", (2, 16, 20)),
-        "eval_camera_to_world": ("<f8", (2, 3, 4)), "eval_intrinsics": ("<f8", (2, 4)),
+        "depth": ("<f4", (2, 16, 20)),
+        "normals": ("<f4", (2, 16, 20, 3)),
+        "seen_frustum": ("<u2", (2, 16, 20)),
+        "seen_open": ("<u2", (2, 16, 20)),
+        "eval_camera_to_world": ("<f8", (2, 3, 4)),
+        "eval_intrinsics": ("<f8", (2, 4)),
         "eval_distortion": ("<f8", (2, 6)),
-        "train_camera_to_world": ("<f8", (2, 3, 4)), "train_intrinsics": ("<f8", (2, 4)),
+        "train_camera_to_world": ("<f8", (2, 3, 4)),
+        "train_intrinsics": ("<f8", (2, 4)),
         "train_distortion": ("<f8", (2, 6)),
-    }  # fmt: skip
+    }
     for name, values in arrays.items():
         text = "x".join(str(length) for length in values.shape) + ":"
         assert hashlib.sha256(text.encode() + values.tobytes()).hexdigest() == manifest["sha256"][name]

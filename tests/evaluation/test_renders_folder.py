@@ -47,8 +47,12 @@ def test_the_path_counts_before_the_name(tmp_path):
 @pytest.mark.parametrize("per_view", [True, False])
 def test_maps_beside_the_colours(renders, per_view):
     rng = np.random.default_rng(0)
-    maps = {"depth": rng.uniform(1, 2, (2, *SHAPE)), "accumulation": rng.random((2, *SHAPE)),
-            "normals": np.tile([0.0, 0, 1], (2, *SHAPE, 1)), "uncertainty": rng.random((2, *SHAPE))}  # fmt: skip
+    maps = {
+        "depth": rng.uniform(1, 2, (2, *SHAPE)),
+        "accumulation": rng.random((2, *SHAPE)),
+        "normals": np.tile([0.0, 0, 1], (2, *SHAPE, 1)),
+        "uncertainty": rng.random((2, *SHAPE)),
+    }
     if per_view:
         for key, values in maps.items():
             (renders / key).mkdir()
@@ -115,8 +119,11 @@ def test_all_mismatches_are_reported_together(renders):
 
 
 def test_another_size_is_said_with_a_way_out(renders):
-    with pytest.raises(ValueError, match=r"2 of 2 pictures .* are not 16 x 12 as the photos are: a.png is 8 x 6, b.png "
-                                         r"is 8 x 6; the photos are 2 times as wide \(see downscale\)"):  # fmt: skip
+    with pytest.raises(
+        ValueError,
+        match=r"2 of 2 pictures .* are not 16 x 12 as the photos are: a.png is 8 x 6, b.png "
+        r"is 8 x 6; the photos are 2 times as wide \(see downscale\)",
+    ):
         read_method("m", renders, VIEWS, (12, 16))
 
 

@@ -44,8 +44,10 @@ def test_the_table_shows_numbers_and_their_absence():
         [{"method": "field", "psnr": 18.98, "ssim": None}, {"method": "dsds", "psnr": 19.5}], ["psnr", "ssim"]
     )
     assert [line.split() for line in text.splitlines()] == [
-        ["method", "psnr", "ssim"], ["field", "18.980", "–"], ["dsds", "19.500", "–"],
-    ]  # fmt: skip
+        ["method", "psnr", "ssim"],
+        ["field", "18.980", "–"],
+        ["dsds", "19.500", "–"],
+    ]
 
 
 def test_the_figure_shows_every_column_and_view(tmp_path):

@@ -37,9 +37,14 @@ def _scene(seed=0):
 
 def _area(convention, renders, truth):
     rows, columns = {
-        "proper": (12, 10), "paper_text": (12, 10), "paper_code": (8, 10), "bayes_rays_masked": (8, 10),
-        "bayes_rays_unmasked": (8, 20), "free_space_prior": (12, 20), "nerfbaselines": (12, 10),
-    }[convention]  # fmt: skip
+        "proper": (12, 10),
+        "paper_text": (12, 10),
+        "paper_code": (8, 10),
+        "bayes_rays_masked": (8, 10),
+        "bayes_rays_unmasked": (8, 20),
+        "free_space_prior": (12, 20),
+        "nerfbaselines": (12, 10),
+    }[convention]
     return np.s_[:rows, :columns]
 
 
@@ -66,10 +71,14 @@ def test_each_convention_by_its_own_definition(convention):
 @pytest.mark.parametrize(
     ("convention", "wanted"),
     [
-        ("proper", 12 * 10 / (16 * 20)), ("paper_text", 12 * 10 / (16 * 20)), ("paper_code", 8 / 16),
-        ("bayes_rays_masked", 8 / 16), ("bayes_rays_unmasked", 8 / 16), ("free_space_prior", 12 / 16),
+        ("proper", 12 * 10 / (16 * 20)),
+        ("paper_text", 12 * 10 / (16 * 20)),
+        ("paper_code", 8 / 16),
+        ("bayes_rays_masked", 8 / 16),
+        ("bayes_rays_unmasked", 8 / 16),
+        ("free_space_prior", 12 / 16),
     ],
-)  # fmt: skip
+)
 def test_coverage_of_each(convention, wanted):
     found = scoring.score_scene(*_scene(), EXTENT, convention=convention).means()
     assert found["coverage"] == pytest.approx(wanted)

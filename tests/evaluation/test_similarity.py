@@ -75,9 +75,14 @@ def test_the_published_codes_map_is_torchmetrics(pattern):
 def test_whole_windows_are_scikit_images(pattern):
     preds, target, mask = (*pattern, DISC)
     oracle = structural_similarity(
-        preds * mask[..., None], target * mask[..., None], gaussian_weights=True, sigma=1.5,
-        use_sample_covariance=False, data_range=1.0, channel_axis=-1,
-    )  # fmt: skip
+        preds * mask[..., None],
+        target * mask[..., None],
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=1.0,
+        channel_axis=-1,
+    )
     found = ssim(preds, target, mask, data_range=1.0, convention="premasked_whole_windows")
     assert found == pytest.approx(oracle, abs=1e-12)
 

@@ -11,9 +11,18 @@ import pytest
 pytest.importorskip("torch")
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
-PARTS = ("fit_cache", "trajectory_scenes", "trajectory_job", "trajectory_rivals", "trajectory_methods",
-         "trajectory_ablation", "trajectory_scores", "trajectory_tables", "trajectory_page",
-         "two_trajectory")  # fmt: skip
+PARTS = (
+    "fit_cache",
+    "trajectory_scenes",
+    "trajectory_job",
+    "trajectory_rivals",
+    "trajectory_methods",
+    "trajectory_ablation",
+    "trajectory_scores",
+    "trajectory_tables",
+    "trajectory_page",
+    "two_trajectory",
+)
 
 
 @pytest.fixture
@@ -34,8 +43,16 @@ def cell(method, scene, coverage, own, spread=None, photos=None, **values):
         for order, points in curves.items()
         if points
     }
-    return {"table": "main", "scene": scene, "seed": 0, "method": method, "convention": "proper", "coverage": coverage,
-            "curves": columns, **values}  # fmt: skip
+    return {
+        "table": "main",
+        "scene": scene,
+        "seed": 0,
+        "method": method,
+        "convention": "proper",
+        "coverage": coverage,
+        "curves": columns,
+        **values,
+    }
 
 
 def test_scores_at_equal_coverage_by_hand(bench):
@@ -100,10 +117,13 @@ def test_tables_have_one_order_whatever_was_run_first(bench):
 
 def test_a_run_with_less_coverage_than_curves_reach_counts_for_nobody(bench):
     cells = [
-        cell("field", "a", 0.8, [(0.8, 18.0), (0.1, 21.0)]), cell("bold", "a", 0.05, [(0.05, 30.0)]),
-        cell("field", "b", 0.8, [(0.8, 18.0), (0.1, 20.0)]), cell("bold", "b", 0.1, [(0.1, 25.0)]),
-        cell("field", "c", 0.8, [(0.8, 18.0), (0.1, 20.0)]), cell("bold", "c", 0.0, []),
-    ]  # fmt: skip
+        cell("field", "a", 0.8, [(0.8, 18.0), (0.1, 21.0)]),
+        cell("bold", "a", 0.05, [(0.05, 30.0)]),
+        cell("field", "b", 0.8, [(0.8, 18.0), (0.1, 20.0)]),
+        cell("bold", "b", 0.1, [(0.1, 25.0)]),
+        cell("field", "c", 0.8, [(0.8, 18.0), (0.1, 20.0)]),
+        cell("bold", "c", 0.0, []),
+    ]
     rows = {row["method"]: row for row in bench["trajectory_tables"].summary_rows(cells)}
     assert (rows["field"]["psnr_at_coverage"], rows["bold"]["psnr_at_coverage"]) == (20.0, 25.0)  # of b alone
 
@@ -144,12 +164,16 @@ def test_the_verdict_counts_scenes_not_means(bench, ours, rival, said):
 def test_an_order_that_all_have_is_nobodys_own(bench):
     page, cells = bench["trajectory_page"], []
     for scene in "abcdef":
-        cells += [cell(method, scene, 0.5, [(0.5, 20.0), (0.1, score)], photos=[(0.5, 20.0), (0.1, score)])
-                  for method, score in (("photo-doubt", 30.0), ("clean", 24.0), ("fitted", 30.0))]  # fmt: skip
+        cells += [
+            cell(method, scene, 0.5, [(0.5, 20.0), (0.1, score)], photos=[(0.5, 20.0), (0.1, score)])
+            for method, score in (("photo-doubt", 30.0), ("clean", 24.0), ("fitted", 30.0))
+        ]
     rows = bench["trajectory_tables"].summary_rows(cells)
     lines = page.who_wins({"rows": rows, "cells": cells})
-    own, photos = (next(line for line in lines if line.startswith(f"| masked PSNR, {name} |")) for name in
-                   ("mean over equal coverages", "mean, all cut by photo doubt"))  # fmt: skip
+    own, photos = (
+        next(line for line in lines if line.startswith(f"| masked PSNR, {name} |"))
+        for name in ("mean over equal coverages", "mean, all cut by photo doubt")
+    )
     assert "| `photo-doubt` 25.00 dB | `fitted` 25.00 dB |" in own
     assert "| **we lose** | `clean` 22.00 dB | `fitted` 25.00 dB | -3.00 (-3.00 to -3.00) |" in photos
 
@@ -248,16 +272,27 @@ def test_the_ablation_and_equal_seconds_run(bench, stage, tmp_path, monkeypatch)
     assert {row["table"] for row in ledger.cells} == {"ablation"}
 
     wanted = ("pseudo-gt", "fitted", "field", "bayes-rays")
-    seconds = main.Options(seeds=(0,), fit_steps=8, methods=wanted, out=tmp_path, cache=tmp_path / "c", threads=1,
-                           equal_seconds=True)  # fmt: skip
+    seconds = main.Options(
+        seeds=(0,), fit_steps=8, methods=wanted, out=tmp_path, cache=tmp_path / "c", threads=1, equal_seconds=True
+    )
     assert seconds.names() == ("field",)
     assert "pseudo-gt" in options.methods
     assert "pseudo-gt" not in main.Options().names(seed=1)
     with pytest.raises(ValueError, match="do the main table of room-1 first"):
         main.run_stage(seconds, stage, cache, main.Ledger(seconds), main.Plan(["field"], {"field": 1.0}))
     ledger = main.Ledger(seconds)
-    took = [{"table": "main", "scene": "room-1", "seed": seed, "method": "visibility", "convention": "proper",
-             "coverage": 0.5, "seconds": each} for seed, each in enumerate((0.2, 0.4, 9.0))]  # fmt: skip
+    took = [
+        {
+            "table": "main",
+            "scene": "room-1",
+            "seed": seed,
+            "method": "visibility",
+            "convention": "proper",
+            "coverage": 0.5,
+            "seconds": each,
+        }
+        for seed, each in enumerate((0.2, 0.4, 9.0))
+    ]
     ledger.add(took)
     elsewhere = main.Ledger(main.Options(out=tmp_path, cache=tmp_path / "c", threads=2))
     elsewhere.add([{**took[0], "seconds": 500.0}])  # on another number of threads: no yardstick
@@ -270,10 +305,17 @@ def test_the_ablation_and_equal_seconds_run(bench, stage, tmp_path, monkeypatch)
 
 def test_of_factors_that_cost_no_psnr_the_best_disparity_is_taken(bench):
     sweep = importlib.import_module("trajectory_sweep")
-    tried = (("tv", "a", 20.0, 0.3), ("tv", "b", 19.95, 0.2), ("tv", "c", 19.8, 0.1), ("sparsity", "a", 20.0, 0.3),
-             ("sparsity", "b", 19.0, 0.2))  # fmt: skip
-    rows = [{"table": loss, "method": name, "psnr_at_coverage": psnr, "disparity_mae_at_coverage": disparity}
-            for loss, name, psnr, disparity in tried]  # fmt: skip
+    tried = (
+        ("tv", "a", 20.0, 0.3),
+        ("tv", "b", 19.95, 0.2),
+        ("tv", "c", 19.8, 0.1),
+        ("sparsity", "a", 20.0, 0.3),
+        ("sparsity", "b", 19.0, 0.2),
+    )
+    rows = [
+        {"table": loss, "method": name, "psnr_at_coverage": psnr, "disparity_mae_at_coverage": disparity}
+        for loss, name, psnr, disparity in tried
+    ]
     assert sweep.chosen_factors(rows) == {"tv": "b", "sparsity": "a"}
 
 

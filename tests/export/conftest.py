@@ -76,7 +76,11 @@ def precisions(
     """The default architecture with random weights in every precision; :func:`exported`'s file for fp32."""
     folder = tmp_path_factory.mktemp("precisions")
     files = export_precisions(
-        exported.checkpoint, folder, precisions=("fp16", "int8"), calibration=calibration, source="balls",
+        exported.checkpoint,
+        folder,
+        precisions=("fp16", "int8"),
+        calibration=calibration,
+        source="balls",
         verify_cubes=0,
-    )  # fmt: skip
+    )
     return {"fp32": exported.onnx, **files}

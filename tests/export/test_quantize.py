@@ -61,8 +61,11 @@ def test_files_say_what_they_are(shipped):
     assert "export" not in plain.training
     assert half.training["export"] == {"precision": "fp16", "fp32_sha256": plain.body_sha256}
     assert small.training["export"] == {
-        "precision": "int8", "fp32_sha256": plain.body_sha256, "calibration": "procedural", "calibration_cubes": 32,
-    }  # fmt: skip
+        "precision": "int8",
+        "fp32_sha256": plain.body_sha256,
+        "calibration": "procedural",
+        "calibration_cubes": 32,
+    }
     for manifest, precision in zip((plain, half, small), PRECISIONS):
         assert precision_of(manifest) == precision
         cleared = {key: value for key, value in manifest.training.items() if key != "export"}

@@ -31,11 +31,14 @@ def pack(value):
 def snapshot(cells, **changes):
     """A whole snapshot of ``cells (cascades, 128^3)`` in Morton order; ``changes`` replace entries of "snapshot"."""
     inner = {
-        "version": 1, "mode": "nerf", "params_binary": b"\x01" * 5000, "density_grid_size": 128,
+        "version": 1,
+        "mode": "nerf",
+        "params_binary": b"\x01" * 5000,
+        "density_grid_size": 128,
         "density_grid_binary": np.asarray(cells, "<f2").tobytes(),
         "aabb": {"min": [0.0, 0.0, 0.0], "max": [1.0, 1.0, 1.0]},
         "nerf": {"aabb_scale": 1, "dataset": {"scale": 0.33, "offset": [0.5, 0.5, 0.5], "from_mitsuba": False}},
-    }  # fmt: skip
+    }
     inner |= changes
     return {"encoding": {"otype": "HashGrid"}, "snapshot": {key: value for key, value in inner.items() if value != ""}}
 

@@ -20,9 +20,15 @@ def pack(value):
         if -32 <= value < 128:
             return struct.pack(">b", value)
         for code, tag, low, high in (
-            (">B", 0xCC, 0, 2**8), (">H", 0xCD, 0, 2**16), (">I", 0xCE, 0, 2**32), (">Q", 0xCF, 0, 2**64),
-            (">b", 0xD0, -(2**7), 0), (">h", 0xD1, -(2**15), 0), (">i", 0xD2, -(2**31), 0), (">q", 0xD3, -(2**63), 0),
-        ):  # fmt: skip
+            (">B", 0xCC, 0, 2**8),
+            (">H", 0xCD, 0, 2**16),
+            (">I", 0xCE, 0, 2**32),
+            (">Q", 0xCF, 0, 2**64),
+            (">b", 0xD0, -(2**7), 0),
+            (">h", 0xD1, -(2**15), 0),
+            (">i", 0xD2, -(2**31), 0),
+            (">q", 0xD3, -(2**63), 0),
+        ):
             if low <= value < high:
                 return bytes([tag]) + struct.pack(code, value)
     if isinstance(value, float):

@@ -279,9 +279,13 @@ def test_ndc_of_the_frustums_corners():
 
 
 @pytest.mark.parametrize(
-    ("name", "ndc"), [("lego-lowres/checkpoint199999", False), ("drums-lowres/checkpoint199999", False),
-                      ("fern-lowres/checkpoint249999", True)],
-)  # fmt: skip
+    ("name", "ndc"),
+    [
+        ("lego-lowres/checkpoint199999", False),
+        ("drums-lowres/checkpoint199999", False),
+        ("fern-lowres/checkpoint249999", True),
+    ],
+)
 @absent
 @pytest.mark.shared_data
 def test_trained_ones(name, ndc):

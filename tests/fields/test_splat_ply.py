@@ -4,8 +4,19 @@ from plyfile import PlyData, PlyElement
 
 from unghost.fields.splat_ply import KEEP_SCORE, Gaussians, read_splat_ply, write_splat_ply
 
-NAMES = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(9)),
-         "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]  # fmt: skip
+NAMES = [
+    "x",
+    "y",
+    "z",
+    "nx",
+    "ny",
+    "nz",
+    *(f"f_dc_{i}" for i in range(3)),
+    *(f"f_rest_{i}" for i in range(9)),
+    "opacity",
+    *(f"scale_{i}" for i in range(3)),
+    *(f"rot_{i}" for i in range(4)),
+]
 
 
 def table(count=20, seed=0, extra=()):
@@ -69,8 +80,12 @@ def test_keeping_all_gives_the_file_back(tmp_path):
 
 
 def test_a_score_that_is_there_is_replaced(tmp_path):
-    write_splat_ply(tmp_path / "b.ply", read_splat_ply(write(tmp_path / "a.ply", table())),
-                    keep=np.ones(20, bool), keep_score=np.zeros(20))  # fmt: skip
+    write_splat_ply(
+        tmp_path / "b.ply",
+        read_splat_ply(write(tmp_path / "a.ply", table())),
+        keep=np.ones(20, bool),
+        keep_score=np.zeros(20),
+    )
     write_splat_ply(
         tmp_path / "c.ply", read_splat_ply(tmp_path / "b.ply"), keep=np.ones(20, bool), keep_score=np.ones(20)
     )

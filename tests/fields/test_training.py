@@ -128,9 +128,12 @@ def test_what_the_regularizer_returns_is_minimised(photos):
     for weight in (0.0, 10.0):
         field = small_field()
         train_field(
-            field, *photos, steps=30, config=QUICK,
+            field,
+            *photos,
+            steps=30,
+            config=QUICK,
             regularizer=lambda field, _, weight=weight: weight * field.density_fn(probe).mean(),
-        )  # fmt: skip
+        )
         densities.append(field.density_fn(probe).item())
     assert densities[1] < 0.2 * densities[0]
 
@@ -146,9 +149,13 @@ def test_stages_go_from_coarse_to_fine_and_fine_tuning_stays_fine(photos):
         sides = []
         config = TrainingConfig(rays=32, sampling=QUICK.sampling, stages=((0.0, 0.4), (0.3, 0.65), (0.5, 1.0)))
         train_field(
-            small_field(), *photos, steps=5, config=config, fine_tune=fine_tune,
+            small_field(),
+            *photos,
+            steps=5,
+            config=config,
+            fine_tune=fine_tune,
             regularizer=lambda field, _: sides.append(field.resolution),  # noqa: B023
-        )  # fmt: skip
+        )
         assert sides == expected
 
 

@@ -33,9 +33,12 @@ def make_pairs(count: int, seed: int) -> dict[str, np.ndarray]:
             labels[index][shell > 0.6] = 2
         signed[index] = 2.0 * opacity - 1.0
     return {
-        "inputs": quantize_signed(signed), "labels": pack_labels(labels), "severity": severity,
-        "edge_fraction": np.linspace(0.02, 0.3, count).astype(np.float32), "group": np.arange(count, dtype=np.int32),
-    }  # fmt: skip
+        "inputs": quantize_signed(signed),
+        "labels": pack_labels(labels),
+        "severity": severity,
+        "edge_fraction": np.linspace(0.02, 0.3, count).astype(np.float32),
+        "group": np.arange(count, dtype=np.int32),
+    }
 
 
 def make_context(count: int, seed: int) -> dict[str, np.ndarray]:
@@ -62,6 +65,12 @@ def shard_paths(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def tiny_config() -> TrainConfig:
     """Six fp32 steps of a tiny network, checkpoints every step on demand only."""
     return TrainConfig(
-        network=TINY, steps=6, batch_size=3, precision="fp32", warmup_steps=1, checkpoint_seconds=1e6,
-        validate_seconds=0.0, seed=3,
-    )  # fmt: skip
+        network=TINY,
+        steps=6,
+        batch_size=3,
+        precision="fp32",
+        warmup_steps=1,
+        checkpoint_seconds=1e6,
+        validate_seconds=0.0,
+        seed=3,
+    )

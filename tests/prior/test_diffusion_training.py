@@ -104,9 +104,12 @@ def test_unet_trains_as_a_restoration_network_too(tiny_config, shard_paths):
 def test_train_writes_a_diffusion(tiny_config, shard_paths, tmp_path):
     config = dataclasses.replace(tiny_config, objective="bernoulli", steps=3)
     result = train(
-        config, train_shards=[(shard_paths["a"], 1.0)], validation_shards={"held": shard_paths["held_out"]},
-        out=tmp_path, progress=False,
-    )  # fmt: skip
+        config,
+        train_shards=[(shard_paths["a"], 1.0)],
+        validation_shards={"held": shard_paths["held_out"]},
+        out=tmp_path,
+        progress=False,
+    )
     denoiser = load_model(result.model)
     assert isinstance(denoiser.network, DiffusionNet)
     assert denoiser.manifest.family == "diffusion"

@@ -47,9 +47,15 @@ print(rank, result.steps, sorted(result.validation), flush=True)
 
 
 CONFIG = TrainConfig(
-    network=NetworkConfig(widths=(8, 8, 8), condition_width=8), steps=6, batch_size=4, precision="fp32", warmup_steps=1,
-    checkpoint_seconds=1e6, validate_seconds=0.0, seed=3,
-)  # fmt: skip
+    network=NetworkConfig(widths=(8, 8, 8), condition_width=8),
+    steps=6,
+    batch_size=4,
+    precision="fp32",
+    warmup_steps=1,
+    checkpoint_seconds=1e6,
+    validate_seconds=0.0,
+    seed=3,
+)
 
 
 def free_port():
@@ -67,10 +73,15 @@ def run(shard_paths, tmp_path_factory):
     def start(out, *, bare=False, victim=-1, step=0, signal_name="SIGKILL", resume=False, timeout=60.0, **changes):
         config = json.loads(dataclasses.replace(CONFIG, checkpoint_steps=2, **changes).to_json())
         spec = {
-            "config": config, "out": str(out), "victim": victim, "step": step, "signal": signal_name,
-            "shards": [[str(shard_paths["a"]), 2.0], [str(shard_paths["b"]), 1.0]], "resume": resume,
+            "config": config,
+            "out": str(out),
+            "victim": victim,
+            "step": step,
+            "signal": signal_name,
+            "shards": [[str(shard_paths["a"]), 2.0], [str(shard_paths["b"]), 1.0]],
+            "resume": resume,
             "validation": {"held": str(shard_paths["held_out"])},
-        }  # fmt: skip
+        }
         env = os.environ | {"OMP_NUM_THREADS": "1", TIMEOUT_VARIABLE: str(timeout)}
         port, words = str(free_port()), [str(script), json.dumps(spec)]
         if not bare:
@@ -80,11 +91,14 @@ def run(shard_paths, tmp_path_factory):
         meeting = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "WORLD_SIZE": "2"}
         return [
             subprocess.Popen(
-                [sys.executable, *words], env=env | meeting | {"RANK": str(rank)}, stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE, text=True,
+                [sys.executable, *words],
+                env=env | meeting | {"RANK": str(rank)},
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
             )
             for rank in range(2)
-        ]  # fmt: skip
+        ]
 
     return start
 
@@ -113,9 +127,13 @@ def difference(first, second):
 def test_two_ranks_give_the_result_of_one_process(whole, shard_paths, tmp_path):
     values, (out, printed) = [], whole
     alone = train(
-        CONFIG, train_shards=[(shard_paths["a"], 2.0), (shard_paths["b"], 1.0)], out=tmp_path / "one",
-        validation_shards={"held": shard_paths["held_out"]}, progress=False, on_step=lambda _, v: values.append(v),
-    )  # fmt: skip
+        CONFIG,
+        train_shards=[(shard_paths["a"], 2.0), (shard_paths["b"], 1.0)],
+        out=tmp_path / "one",
+        validation_shards={"held": shard_paths["held_out"]},
+        progress=False,
+        on_step=lambda _, v: values.append(v),
+    )
     assert sorted(re.findall(r"^\d 6 .*$", printed, re.M)) == ["0 6 ['held']", "1 6 []"]  # one of them validates
     found = difference(tmp_path / "one", out)
     assert found["live"] < TOLERANCE

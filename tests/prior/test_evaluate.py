@@ -113,9 +113,12 @@ def test_ignored_voxels_do_not_count(tmp_path):
     signed[0, :16], labels[0, :16] = 1.0, 2
     signed[0, 20], labels[0, 20] = 1.0, 1
     arrays = {
-        "inputs": quantize_signed(signed), "labels": pack_labels(labels), "severity": np.ones(1, np.float32),
-        "edge_fraction": np.ones(1, np.float32), "group": np.zeros(1, np.int32),
-    }  # fmt: skip
+        "inputs": quantize_signed(signed),
+        "labels": pack_labels(labels),
+        "severity": np.ones(1, np.float32),
+        "edge_fraction": np.ones(1, np.float32),
+        "group": np.zeros(1, np.int32),
+    }
     write_shard(tmp_path / "shard", arrays, {})
     row = evaluate(Rule(lambda c: c), read_shard(tmp_path / "shard"))
     assert row["iou_before"] == row["iou"] == 1.0

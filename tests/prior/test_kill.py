@@ -112,17 +112,25 @@ def config():
     from unghost.prior.network import NetworkConfig
 
     return TrainConfig(
-        network=NetworkConfig(widths=(8, 8, 8), condition_width=8), steps=6, batch_size=2, precision="fp32",
-        warmup_steps=1, checkpoint_seconds=1e6, checkpoint_steps=1, validate_seconds=0.0, seed=3,
-    )  # fmt: skip
+        network=NetworkConfig(widths=(8, 8, 8), condition_width=8),
+        steps=6,
+        batch_size=2,
+        precision="fp32",
+        warmup_steps=1,
+        checkpoint_seconds=1e6,
+        checkpoint_steps=1,
+        validate_seconds=0.0,
+        seed=3,
+    )
 
 
 @pytest.fixture(scope="module")
 def settings(shard_paths):
     return {
-        "train_shards": [(shard_paths["a"], 1.0)], "validation_shards": {"held": shard_paths["held_out"]},
+        "train_shards": [(shard_paths["a"], 1.0)],
+        "validation_shards": {"held": shard_paths["held_out"]},
         "progress": False,
-    }  # fmt: skip
+    }
 
 
 @pytest.fixture(scope="module")
@@ -131,13 +139,19 @@ def killed(config, shard_paths, tmp_path_factory):
     root = tmp_path_factory.mktemp("killed")
     folders = {name: root / str(index) for index, name in enumerate(MOMENTS)}
     spec = {
-        "config": dataclasses.asdict(config), "shard": str(shard_paths["a"]), "held": str(shard_paths["held_out"]),
+        "config": dataclasses.asdict(config),
+        "shard": str(shard_paths["a"]),
+        "held": str(shard_paths["held_out"]),
         "moments": {str(folders[name]): moment for name, moment in MOMENTS.items()},
-    }  # fmt: skip
+    }
     done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, json.dumps(spec)], env=os.environ | {"OMP_NUM_THREADS": "1"},
-        capture_output=True, text=True, timeout=500, check=False,
-    )  # fmt: skip
+        [sys.executable, "-c", PROGRAM, json.dumps(spec)],
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=500,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr[-3000:]
     signals = dict(json.loads(line) for line in done.stdout.splitlines())
     return {name: (folder, signals[str(folder)]) for name, folder in folders.items()}

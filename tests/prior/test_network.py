@@ -136,10 +136,16 @@ def test_every_output_depends_on_far_away_input():
 
 
 WEIGHTS_OF_ONE_CHANNEL = {
-    "stem": (8, 8, 3, 3, 3), "down_middle": (16, 8, 2, 2, 2), "down_coarse": (8, 16, 2, 2, 2), "head": (8, 8, 3, 3, 3),
-    "condition.0": (8, 18), "condition.2": (8, 8), "condition.4": (40, 8), "up_middle.mix": (128, 8, 1, 1, 1),
+    "stem": (8, 8, 3, 3, 3),
+    "down_middle": (16, 8, 2, 2, 2),
+    "down_coarse": (8, 16, 2, 2, 2),
+    "head": (8, 8, 3, 3, 3),
+    "condition.0": (8, 18),
+    "condition.2": (8, 8),
+    "condition.4": (40, 8),
+    "up_middle.mix": (128, 8, 1, 1, 1),
     "up_fine.mix": (64, 16, 1, 1, 1),
-}  # fmt: skip
+}
 
 
 def test_a_network_of_one_channel_keeps_its_layout():

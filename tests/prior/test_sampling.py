@@ -167,9 +167,14 @@ def test_steps_are_reported_and_deterministic_sampling_draws_once(networks):
     seen = []
     generators = seeded(9)
     sample_gaussian(
-        normal_data(0.0, 0.5), (1, 5), ONE, generators=generators, steps=4, eta=0.0,
+        normal_data(0.0, 0.5),
+        (1, 5),
+        ONE,
+        generators=generators,
+        steps=4,
+        eta=0.0,
         on_step=lambda step, x0: seen.append((step, x0.shape)),
-    )  # fmt: skip
+    )
     assert seen == [(999, (1, 5)), (666, (1, 5)), (333, (1, 5)), (0, (1, 5))]
     fresh = seeded(9)[0]
     torch.randn((5,), generator=fresh)

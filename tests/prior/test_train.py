@@ -53,8 +53,13 @@ def test_a_whole_run(tiny_config, shards, tmp_path):
     assert all(math.isfinite(values["loss"]) for _, values in seen)
     names = {item.name for item in (tmp_path / "run").iterdir()}
     assert names == {
-        "config.json", "log.jsonl", "model.safetensors", "state.safetensors", "tensorboard", "validation.json",
-    }  # fmt: skip
+        "config.json",
+        "log.jsonl",
+        "model.safetensors",
+        "state.safetensors",
+        "tensorboard",
+        "validation.json",
+    }
     denoiser = load_model(result.model)
     row = result.validation["held"]
     assert row["cubes"] == 10
@@ -101,8 +106,15 @@ def test_all_channels_and_an_online_recipe_resume_with_the_same_bits(tiny_config
     def run(out, **more):
         online = [Online("procedural", 0.3, OnlinePairs(load_recipe("procedural"), seed=11))]
         shards = [(shard_paths["seen"], 1.0)]
-        return train(config, train_shards=shards, validation_shards={"seen": shard_paths["seen"]}, online=online,
-                     out=tmp_path / out, progress=False, **more)  # fmt: skip
+        return train(
+            config,
+            train_shards=shards,
+            validation_shards={"seen": shard_paths["seen"]},
+            online=online,
+            out=tmp_path / out,
+            progress=False,
+            **more,
+        )
 
     whole = run("whole")
     with pytest.raises(Killed):

@@ -19,15 +19,30 @@ def test_loader_network_and_both(shard_paths, tmp_path, monkeypatch):
     monkeypatch.setattr(training_speed.torch, "set_num_threads", lambda count: None)  # other tests keep theirs
     monkeypatch.setattr(training_speed, "keep_freed_memory", lambda: True)
     monkeypatch.setattr(
-        sys, "argv",
-        ["training_speed.py", str(shard_paths["a"]), "--sizes", "xs", "--batches", "1", "--batch-size", "2",
-         "--threads", "1", "--out", str(tmp_path)],
-    )  # fmt: skip
+        sys,
+        "argv",
+        [
+            "training_speed.py",
+            str(shard_paths["a"]),
+            "--sizes",
+            "xs",
+            "--batches",
+            "1",
+            "--batch-size",
+            "2",
+            "--threads",
+            "1",
+            "--out",
+            str(tmp_path),
+        ],
+    )
     training_speed.main()
     found = json.loads((tmp_path / "training_speed.json").read_text(encoding="utf-8"))
     assert [(row["method"], len(row["channels"]), row["memory"]) for row in found["rows"]] == [
-        ("xs", 1, "returned"), ("xs", 1, "kept"), ("xs", 4, "kept"),
-    ]  # fmt: skip
+        ("xs", 1, "returned"),
+        ("xs", 1, "kept"),
+        ("xs", 4, "kept"),
+    ]
     for row in found["rows"]:
         assert row["loader_over_network"] == pytest.approx(
             row["loader_cubes_per_second"] / row["network_cubes_per_second"]

@@ -169,9 +169,13 @@ def test_the_regularizer_tells_all_it_knows(kit, aabb, crowd, rotate):
     regularizer, denoiser = build(kit, aabb, CHANNEL_NAMES, crowd, rotate=rotate)
     regularizer.observe(unit_lattice(8) * 1.9, np.ones((8, 8, 8)))
     cubes = draw_cubes(
-        regularizer.grid, regularizer._rng(0), regularizer.settings, field_pitch=PITCH, resolution=32,
+        regularizer.grid,
+        regularizer._rng(0),
+        regularizer.settings,
+        field_pitch=PITCH,
+        resolution=32,
         device=torch.device("cpu"),
-    )  # fmt: skip
+    )
     regularizer(waves_of_tensors)
     given = denoiser.calls[0][0]
     assert given.shape == (5, len(CHANNEL_NAMES), 32, 32, 32)

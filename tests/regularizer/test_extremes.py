@@ -169,9 +169,17 @@ def test_a_step_of_the_regularizer(kit, aabb, lone_camera, values, answer, rule,
         return values[((p > 0) * torch.tensor([1, 2, 4])).sum(dim=1)]
 
     regularizer = DensityRegularizer(
-        kit.numpy_denoiser(kit.functions[answer]), aabb=aabb, cameras=lone_camera, rule=rule, field_pitch=pitch,
-        skip_empty=skip_empty, cubes=1, edge_range=(0.9, 0.9), visibility_samples=64, dsds_weight=1.0,
-    )  # fmt: skip
+        kit.numpy_denoiser(kit.functions[answer]),
+        aabb=aabb,
+        cameras=lone_camera,
+        rule=rule,
+        field_pitch=pitch,
+        skip_empty=skip_empty,
+        cubes=1,
+        edge_range=(0.9, 0.9),
+        visibility_samples=64,
+        dsds_weight=1.0,
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", message="DensityRegularizer: density_fn returned")

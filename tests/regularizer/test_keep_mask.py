@@ -101,8 +101,14 @@ def test_foreign_and_broken_files_are_named(tmp_path):
         KeepMask.load(path)
     halves().save(path)
     whole = path.read_bytes()
-    good = {"format": "unghost-keep-mask", "format_version": 1, "aabb": BOX.tolist(), "pitch": 0.5,
-            "shape": [4, 2, 2], "details": {}}  # fmt: skip
+    good = {
+        "format": "unghost-keep-mask",
+        "format_version": 1,
+        "aabb": BOX.tolist(),
+        "pitch": 0.5,
+        "shape": [4, 2, 2],
+        "details": {},
+    }
     bits = np.zeros(2, np.uint8)
     write_npz(path, good, bits)
     KeepMask.load(path)

@@ -22,8 +22,10 @@ def wall(cameras, height=0.0):
     for index in range(len(cameras)):
         origins, directions = cameras.rays(index)
         ground = origins - directions * (origins[..., 2:] / directions[..., 2:])
-        painting = 0.5 + 0.4 * np.stack([np.sin(4 * ground[..., 0]), np.cos(3 * ground[..., 1]),
-                                         np.sin(2 * ground[..., 0] + ground[..., 1])], axis=-1)  # fmt: skip
+        painting = 0.5 + 0.4 * np.stack(
+            [np.sin(4 * ground[..., 0]), np.cos(3 * ground[..., 1]), np.sin(2 * ground[..., 0] + ground[..., 1])],
+            axis=-1,
+        )
         photos.append(painting)
         depths.append((height - origins[..., 2]) / directions[..., 2])
     return np.stack(photos), np.stack(depths)
@@ -67,8 +69,9 @@ def test_photos_in_which_the_point_is_on_the_surface_make_it_surer(nearer):
     camera, many = looking_down([(0.0, 0.0)]), looking_down([(0.0, 0.0)] * 8)
     grey, photos = np.full((1, SIDE, SIDE, 3), 0.5), np.full((8, SIDE, SIDE, 3), 0.25)
     depth = np.full((1, SIDE, SIDE), 2.0)
-    found = photo_doubt(grey, depth * nearer, camera, photos=photos, photo_depth=np.repeat(depth, 8, axis=0),
-                        photo_cameras=many)  # fmt: skip
+    found = photo_doubt(
+        grey, depth * nearer, camera, photos=photos, photo_depth=np.repeat(depth, 8, axis=0), photo_cameras=many
+    )
     np.testing.assert_allclose(found[0, 5:-5, 5:-5], 0.25 / (3.0 if nearer > 0.95 else 1.0), rtol=1e-6)
 
 
@@ -77,8 +80,9 @@ def test_a_photo_that_looks_into_nothing_sees_but_has_no_surface(tolerance):
     camera = looking_down([(0.0, 0.0)])
     grey, photos = np.full((1, SIDE, SIDE, 3), 0.5), np.full((1, SIDE, SIDE, 3), 0.25)
     depth = np.full((1, SIDE, SIDE), 2.0)
-    found = photo_doubt(grey, depth, camera, photos=photos, photo_depth=depth * np.inf, photo_cameras=camera,
-                        tolerance=tolerance)  # fmt: skip
+    found = photo_doubt(
+        grey, depth, camera, photos=photos, photo_depth=depth * np.inf, photo_cameras=camera, tolerance=tolerance
+    )
     np.testing.assert_allclose(found[0, 5:-5, 5:-5], 0.25, rtol=1e-6)
 
 
@@ -88,8 +92,14 @@ def test_the_mean_over_photos_that_have_no_surface_there_does_not_depend_on_thei
     photos, photo_depth = wall(taught)
 
     def found(order):
-        return photo_doubt(colors, depth, seen, photos=photos[order], photo_depth=photo_depth[order],
-                           photo_cameras=taught.select(order))  # fmt: skip
+        return photo_doubt(
+            colors,
+            depth,
+            seen,
+            photos=photos[order],
+            photo_depth=photo_depth[order],
+            photo_cameras=taught.select(order),
+        )
 
     np.testing.assert_allclose(found([0, 1, 2]), found([2, 0, 1]), rtol=1e-5)
     singles = np.stack([found([index]) for index in range(3)])
@@ -103,8 +113,13 @@ def test_bilinear_samples_agree_with_scipy():
 
     rng = np.random.default_rng(0)
     image, pixels = rng.uniform(size=(7, 9, 3)), rng.uniform(-1, 11, size=(200, 2))
-    wanted = np.stack([map_coordinates(image[..., channel], [pixels[:, 1] - 0.5, pixels[:, 0] - 0.5], order=1,
-                                       mode="nearest") for channel in range(3)], axis=-1)  # fmt: skip
+    wanted = np.stack(
+        [
+            map_coordinates(image[..., channel], [pixels[:, 1] - 0.5, pixels[:, 0] - 0.5], order=1, mode="nearest")
+            for channel in range(3)
+        ],
+        axis=-1,
+    )
     np.testing.assert_allclose(sample_bilinear(image, pixels), wanted, atol=1e-12)
 
 
@@ -122,7 +137,14 @@ def test_bilinear_samples_agree_with_scipy():
 def test_errors_name_argument_and_rule(change, message):
     camera = looking_down([(0.0, 0.0)])
     grey, depth = np.full((1, SIDE, SIDE, 3), 0.5), np.full((1, SIDE, SIDE), 2.0)
-    given = {"colors": grey, "depth": depth, "cameras": camera, "photos": grey, "photo_depth": depth,
-             "photo_cameras": camera, **change}  # fmt: skip
+    given = {
+        "colors": grey,
+        "depth": depth,
+        "cameras": camera,
+        "photos": grey,
+        "photo_depth": depth,
+        "photo_cameras": camera,
+        **change,
+    }
     with pytest.raises(ValueError, match=f"photo_doubt: {message}"):
         photo_doubt(**given)

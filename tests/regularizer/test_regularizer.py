@@ -484,8 +484,9 @@ def test_cameras_inside_out_are_pointed_out_by_both(kit, aabb):
     with pytest.warns(UserWarning, match=r"DensityRegularizer: .*OpenCV"):
         build(kit, aabb, kit.identity, cameras=inside_out())
     with pytest.warns(UserWarning, match=r"clean: .*OpenCV"):
-        clean(lambda p: p[:, 0] ** 2, aabb, denoiser=kit.numpy_denoiser(kit.identity), resolution=8,
-              cameras=inside_out())  # fmt: skip
+        clean(
+            lambda p: p[:, 0] ** 2, aabb, denoiser=kit.numpy_denoiser(kit.identity), resolution=8, cameras=inside_out()
+        )
 
 
 def test_what_something_hides_counts_as_unseen(kit, aabb):

@@ -18,9 +18,19 @@ def surveyed(density, probe, *, boxes=(), drop_invalid=False, rows=1 << 18):
     box = np.array([[0.0, 0.0, 0.0], density.shape])
     query = make_query(grid_density_fn(density, box), place=box.mean(axis=0), caller="clean")
     return survey_field(
-        query, box, 1.0, density.shape, rule=RULE, faint=0.1, opaque_pitch=1.0, soft=True, keep_boxes=boxes,
-        probe=probe, drop_invalid=drop_invalid, rows=rows,
-    )  # fmt: skip
+        query,
+        box,
+        1.0,
+        density.shape,
+        rule=RULE,
+        faint=0.1,
+        opaque_pitch=1.0,
+        soft=True,
+        keep_boxes=boxes,
+        probe=probe,
+        drop_invalid=drop_invalid,
+        rows=rows,
+    )
 
 
 @settings(max_examples=60, deadline=None)
@@ -96,8 +106,20 @@ def test_keep_boxes_and_cells_beyond_the_box():
     box = np.array([[0.0, 0.0, 0.0], [3.2, 3.2, 3.2]])  # four cells, the outer ones' middles beyond the box
     query = make_query(lambda p: np.ones(len(p)), place=box.mean(axis=0), caller="clean")
     with pytest.warns(UserWarning, match="does it use its positions"):
-        found = survey_field(query, box, 1.0, (6, 4, 4), rule=RULE, faint=0.1, opaque_pitch=1.0, soft=True,
-                             keep_boxes=(), probe=2, drop_invalid=False, rows=99)  # fmt: skip
+        found = survey_field(
+            query,
+            box,
+            1.0,
+            (6, 4, 4),
+            rule=RULE,
+            faint=0.1,
+            opaque_pitch=1.0,
+            soft=True,
+            keep_boxes=(),
+            probe=2,
+            drop_invalid=False,
+            rows=99,
+        )
     assert found.judged.sum() == 4 * 4 * 4
 
 
@@ -108,10 +130,15 @@ def test_clean_says_how_often_it_asked_and_decides_alike(kit):
     density.flat[rng.integers(0, density.size, 60)] = 40.0
     box = np.array([[0.0, 0.0, 0.0], density.shape]) / 10
     masks = [
-        clean(grid_density_fn(density * 10, box), box, denoiser=kit.numpy_denoiser(kit.identity), field_pitch=0.1,
-              probe=probe)
+        clean(
+            grid_density_fn(density * 10, box),
+            box,
+            denoiser=kit.numpy_denoiser(kit.identity),
+            field_pitch=0.1,
+            probe=probe,
+        )
         for probe in (1, 2)
-    ]  # fmt: skip
+    ]
     assert (masks[0].cells == masks[1].cells).all()
     assert not masks[0].cells.all()
     assert masks[1].details["asked"] < masks[0].details["asked"] == density.size

@@ -51,10 +51,16 @@ def test_cells_settle_nothing_wrongly(lens, min_views):
     plain = cameras()
     rig = Cameras.create(plain.camera_to_world, plain.intrinsics, plain.width, plain.height, LENSES[lens])
     rng = np.random.default_rng(1)
-    points = np.concatenate([
-        rng.uniform(BOX[0], BOX[1], (4000, 3)), rng.uniform(-3, 3, (1000, 3)), rig.origins, BOX,
-        rig.origins - 1e-7, np.full((1, 3), 1e30),
-    ])  # fmt: skip
+    points = np.concatenate(
+        [
+            rng.uniform(BOX[0], BOX[1], (4000, 3)),
+            rng.uniform(-3, 3, (1000, 3)),
+            rig.origins,
+            BOX,
+            rig.origins - 1e-7,
+            np.full((1, 3), 1e30),
+        ]
+    )
     full = rig.view_count(points)
     for counter in (ViewCounter(rig, min_views=min_views), ViewCounter(rig, min_views=min_views, aabb=BOX)):
         np.testing.assert_array_equal(np.minimum(counter(points), min_views), np.minimum(full, min_views))

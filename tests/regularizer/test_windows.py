@@ -54,9 +54,13 @@ def test_skipping_changes_no_wanted_cell(kit, kind):
 def test_progress_and_what_the_denoiser_is_told(kit):
     denoiser, seen = kit.numpy_denoiser(kit.identity), []
     vote(
-        np.zeros((128, 64, 64), np.float32), np.ones((128, 64, 64), bool), denoiser=denoiser, timestep=7,
-        edge_fraction=0.25, progress=lambda done, total: seen.append((done, total)),
-    )  # fmt: skip
+        np.zeros((128, 64, 64), np.float32),
+        np.ones((128, 64, 64), bool),
+        denoiser=denoiser,
+        timestep=7,
+        edge_fraction=0.25,
+        progress=lambda done, total: seen.append((done, total)),
+    )
     assert seen[-1] == (225, 225)  # 9 x 5 x 5
     assert all((call[1] == 7).all() and (call[2] == np.float32(0.25)).all() for call in denoiser.calls)
     assert all(len(call[0]) <= 40 for call in denoiser.calls)

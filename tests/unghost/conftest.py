@@ -12,9 +12,17 @@ import pytest
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 FLAGS = (
-    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-dev-shm-usage",
-    "--disable-background-networking", "--disable-component-update", "--disable-sync", "--remote-debugging-pipe",
-)  # fmt: skip
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-dev-shm-usage",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--remote-debugging-pipe",
+)
 PATIENCE = 60  # seconds for any one answer
 
 
@@ -64,8 +72,9 @@ class Page:
         return found["result"].get("value")
 
     def open(self, path, *, width=1400, height=1000, dark=False, scripts=True):
-        self.ask("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1,
-                 mobile=width < 700)  # fmt: skip
+        self.ask(
+            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 700
+        )
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self.ask("Emulation.setEmulatedMedia", features=[scheme])
         self.ask("Emulation.setScriptExecutionDisabled", value=not scripts)
@@ -80,8 +89,10 @@ class Page:
     def drag(self, selector, *, to):
         """Press in the middle of an element and let go at a share of its width."""
         self.look(f"document.querySelector({json.dumps(selector)}).scrollIntoView({{block: 'center'}})")
-        box = self.look(f"(b => [b.x, b.y, b.width, b.height])(document.querySelector({json.dumps(selector)})"
-                        ".getBoundingClientRect())")  # fmt: skip
+        box = self.look(
+            f"(b => [b.x, b.y, b.width, b.height])(document.querySelector({json.dumps(selector)})"
+            ".getBoundingClientRect())"
+        )
         y = box[1] + box[3] / 2
         for kind, share, held in (("mousePressed", 0.5, 1), ("mouseMoved", to, 1), ("mouseReleased", to, 0)):
             x = box[0] + box[2] * share

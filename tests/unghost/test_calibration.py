@@ -64,10 +64,13 @@ def test_further_channels_come_from_shards_and_are_unknown_in_recipes(tmp_path):
     assert made.channels.shape == (1, 2, 32, 32, 32)
     assert (made.channels[:, 1] == UNKNOWN).all()
     arrays = {
-        "inputs": np.zeros((3, 32, 32, 32), np.uint8), "labels": np.zeros((3, 8192), np.uint8),
-        "severity": np.zeros(3, np.float32), "edge_fraction": np.full(3, 0.1, np.float32),
-        "group": np.zeros(3, np.int32), "view_count": np.full((3, 32, 32, 32), 7, np.uint8),
-    }  # fmt: skip
+        "inputs": np.zeros((3, 32, 32, 32), np.uint8),
+        "labels": np.zeros((3, 8192), np.uint8),
+        "severity": np.zeros(3, np.float32),
+        "edge_fraction": np.full(3, 0.1, np.float32),
+        "group": np.zeros(3, np.int32),
+        "view_count": np.full((3, 32, 32, 32), 7, np.uint8),
+    }
     write_shard(tmp_path / "shard", arrays, {})
     stored = calibration_for(tmp_path / "two.safetensors", tmp_path / "shard", cubes=2, seed=0)
     np.testing.assert_array_equal(

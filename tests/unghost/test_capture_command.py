@@ -62,8 +62,12 @@ def test_two_videos_become_a_capture(room, tmp_path, capsys):
     assert "every 8th training photo" in printed
     assert plot.stat().st_size > 10_000
     assert {path.name for path in out.iterdir()} == {
-        "images", "sparse", "transforms.json", "splits.json", "capture.json",
-    }  # fmt: skip
+        "images",
+        "sparse",
+        "transforms.json",
+        "splits.json",
+        "capture.json",
+    }
     told = json.loads((out / "capture.json").read_text())
     assert [told["frames"][f"frame_0000{k}.jpg"] for k in range(1, 9)] == list(range(1, 17, 2))  # the sharp ones
     capture = load_capture(out, downscale=1)
@@ -102,11 +106,14 @@ def test_bad_input_is_one_line_and_leaves_nothing(case, tmp_path, capsys, monkey
     assert run("capture", *words, "--out", "out", *extra) == 2
     error = capsys.readouterr().err.splitlines()[-1]  # what stands before are progress bars
     message = {
-        "gone": "no video or folder z to be scored on", "broken": "cannot read c.mp4 as a video",
-        "empty": "no photos in b (looked for .jpg", "sizes": "train 96 x 96, eval 128 x 96",
-        "in use": "out is there already and not empty", "plot": "--plot must end in .png",
+        "gone": "no video or folder z to be scored on",
+        "broken": "cannot read c.mp4 as a video",
+        "empty": "no photos in b (looked for .jpg",
+        "sizes": "train 96 x 96, eval 128 x 96",
+        "in use": "out is there already and not empty",
+        "plot": "--plot must end in .png",
         "blank": "COLMAP posed no photos (train 0 of 3, eval 0 of 3)",
-    }[case]  # fmt: skip
+    }[case]
     assert error.startswith("unghost capture: ")
     assert message in error
     assert sorted(path.name for path in tmp_path.rglob("*")) == before

@@ -10,9 +10,22 @@ from unghost.core.shards import write_shard
 from unghost.grids import load_grid, save_grid
 
 VERBS = (
-    "demo", "clean", "masks", "capture", "convert", "evaluate", "report", "bench", "curate", "harvest", "preview",
-    "train", "sample", "export", "verify",
-)  # fmt: skip
+    "demo",
+    "clean",
+    "masks",
+    "capture",
+    "convert",
+    "evaluate",
+    "report",
+    "bench",
+    "curate",
+    "harvest",
+    "preview",
+    "train",
+    "sample",
+    "export",
+    "verify",
+)
 
 
 def small_shard(folder, count):

@@ -14,15 +14,22 @@ CHECKPOINTS = ROOT.parent / "shared" / "data" / "nerf_checkpoints"
 WITH_A_PATH = {"nerf_pytorch"}  # examples that need a file of the reader's own
 EXAMPLES = [path for path in sorted((ROOT / "examples").glob("*.py")) if path.stem not in WITH_A_PATH]
 AT_LEAST = {  # per cent of the ghosts gone, and of the rest kept, as the example prints them
-    "instant_ngp": (95, 95), "numpy_callable": (95, 95), "signed_distance": (95, 95), "splats": (80, 98),
-}  # fmt: skip
+    "instant_ngp": (95, 95),
+    "numpy_callable": (95, 95),
+    "signed_distance": (95, 95),
+    "splats": (80, 98),
+}
 
 
 def run(name, *arguments, folder):
     done = subprocess.run(
         [sys.executable, "-W", "error", ROOT / "examples" / f"{name}.py", *arguments],
-        cwd=folder, capture_output=True, text=True, timeout=580, check=False,
-    )  # fmt: skip
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=580,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -57,13 +64,19 @@ def half_space(folder, *, no_ndc):
     for axis in range(3):
         layer1[2 * axis, axis], layer1[2 * axis + 1, axis] = 1.0, -1.0
     state = {
-        "layer1.weight": layer1, "layer1.bias": torch.zeros(6),
-        "layers_xyz.0.weight": eye, "layers_xyz.0.bias": torch.zeros(6),
-        "fc_alpha.weight": alpha, "fc_alpha.bias": torch.tensor([-200.0]),
-        "fc_feat.weight": eye, "fc_feat.bias": torch.zeros(6),
-        "layers_dir.0.weight": torch.full((3, 6 + 27), 0.1), "layers_dir.0.bias": torch.zeros(3),
-        "fc_rgb.weight": torch.eye(3), "fc_rgb.bias": torch.tensor([0.0, 1.0, -1.0]),
-    }  # fmt: skip
+        "layer1.weight": layer1,
+        "layer1.bias": torch.zeros(6),
+        "layers_xyz.0.weight": eye,
+        "layers_xyz.0.bias": torch.zeros(6),
+        "fc_alpha.weight": alpha,
+        "fc_alpha.bias": torch.tensor([-200.0]),
+        "fc_feat.weight": eye,
+        "fc_feat.bias": torch.zeros(6),
+        "layers_dir.0.weight": torch.full((3, 6 + 27), 0.1),
+        "layers_dir.0.bias": torch.zeros(3),
+        "fc_rgb.weight": torch.eye(3),
+        "fc_rgb.bias": torch.tensor([0.0, 1.0, -1.0]),
+    }
     path = folder / "checkpoint.ckpt"
     torch.save({"iter": 0, "model_fine_state_dict": state}, path)
     (folder / "config.yml").write_text(f"dataset:\n  no_ndc: {str(no_ndc).lower()}\n", encoding="utf-8")

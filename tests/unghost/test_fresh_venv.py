@@ -57,8 +57,13 @@ def ask(interpreter, program, *arguments):
     env = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
     return subprocess.run(
         [str(interpreter), "-W", "error", "-c", textwrap.dedent(program), *map(str, arguments)],
-        capture_output=True, text=True, timeout=300, env=env, cwd=Path(interpreter).parent, check=False,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env=env,
+        cwd=Path(interpreter).parent,
+        check=False,
+    )
 
 
 def test_nothing_else_is_there(python):

@@ -7,9 +7,19 @@ import textwrap
 import pytest
 
 ABSENT = (
-    "torch", "onnx", "onnxscript", "safetensors", "trimesh", "open3d", "scipy", "skimage", "matplotlib", "PIL",
-    "pycolmap", "av",
-)  # fmt: skip
+    "torch",
+    "onnx",
+    "onnxscript",
+    "safetensors",
+    "trimesh",
+    "open3d",
+    "scipy",
+    "skimage",
+    "matplotlib",
+    "PIL",
+    "pycolmap",
+    "av",
+)
 BLOCKER = f"""
 import sys
 
@@ -26,8 +36,11 @@ sys.meta_path.insert(0, Blocker())
 def run(program):
     return subprocess.run(
         [sys.executable, "-W", "error", "-c", BLOCKER + textwrap.dedent(program)],
-        capture_output=True, text=True, timeout=120, check=False,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
 
 
 def test_the_base_install_imports_and_has_a_cleaner():
@@ -91,8 +104,14 @@ def test_the_guard_can_fail(package):
 
 def test_import_is_light():
     done = subprocess.run(
-        [sys.executable, "-c", "import sys, unghost; print([n for n in ('numpy', 'torch', 'tyro', 'onnxruntime') "
-         "if n in sys.modules])"],
-        capture_output=True, text=True, timeout=60, check=True,
-    )  # fmt: skip
+        [
+            sys.executable,
+            "-c",
+            "import sys, unghost; print([n for n in ('numpy', 'torch', 'tyro', 'onnxruntime') if n in sys.modules])",
+        ],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+    )
     assert done.stdout.strip() == "[]"

@@ -35,8 +35,12 @@ def test_writes_cubes_and_pictures(objective, tmp_path, capsys):
     assert cli.main(words) == 0
     assert "3 cubes" in capsys.readouterr().out
     assert sorted(item.name for item in out.iterdir()) == [
-        "cube-000.png", "cube-001.png", "cube-002.png", "cubes.npz", "sheet.png",
-    ]  # fmt: skip
+        "cube-000.png",
+        "cube-001.png",
+        "cube-002.png",
+        "cubes.npz",
+        "sheet.png",
+    ]
     with np.load(out / "cubes.npz") as stored:
         signed, occupancy, facts = stored["signed"], stored["occupancy"], json.loads(str(stored["facts"]))
     assert signed.shape == occupancy.shape == (3, 32, 32, 32)

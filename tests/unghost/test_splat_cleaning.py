@@ -122,9 +122,14 @@ def test_no_file_is_written_over_another(scene, tmp_path, capsys):
     (tmp_path / "link.npz").symlink_to(tmp_path / "g.npz")
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     for words in (
-        ["g.npz", "-o", "g.npz"], ["g.npz", "--keep", "g.npz"], ["s.ply", "--keep", "s.ply"], ["s.ply", "-o", "s.ply"],
-        ["g.npz", "-o", "g-keep.npz"], ["g.npz", "--preview", "g.npz"], ["g.npz", "-o", "link.npz"],
-    ):  # fmt: skip
+        ["g.npz", "-o", "g.npz"],
+        ["g.npz", "--keep", "g.npz"],
+        ["s.ply", "--keep", "s.ply"],
+        ["s.ply", "-o", "s.ply"],
+        ["g.npz", "-o", "g-keep.npz"],
+        ["g.npz", "--preview", "g.npz"],
+        ["g.npz", "-o", "link.npz"],
+    ):
         assert cli.main(["clean", *(str(tmp_path / w) if not w.startswith("-") else w for w in words)]) == 2, words
         assert "are the same file" in capsys.readouterr().err
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
@@ -159,8 +164,12 @@ def test_never_onto_itself_and_nothing_half_written(scene, tmp_path, capsys):
 
 
 def test_scores_alone(scene, tmp_path):
-    assert cli.main(["clean", str(scene), "-o", str(tmp_path / "all.ply"), "--scores-only", "--keep",
-                     str(tmp_path / "k.npz")]) == 0  # fmt: skip
+    assert (
+        cli.main(
+            ["clean", str(scene), "-o", str(tmp_path / "all.ply"), "--scores-only", "--keep", str(tmp_path / "k.npz")]
+        )
+        == 0
+    )
     before, after = read_splat_ply(scene).rows, read_splat_ply(tmp_path / "all.ply").rows
     assert (after[list(before.dtype.names)].astype(before.dtype) == before).all()
     ghost, score = np.asarray(before["made_as"]) == 1, np.asarray(after["keep_score"])
