@@ -171,11 +171,11 @@ def page(options: Options, found: dict[str, Any], sample_bytes: int) -> str:
             "# The harvest",
             "",
             "What a badly constrained field gets wrong is thick smooth fog, not blobs, and no synthetic corruption "
-            "looks like it. So the larger part of the training pairs is *harvested*: a synthetic room of known geometry is "
-            f"photographed along a casual sweep ({config.photos[0]}–{config.photos[1]} small photos with wrong "
-            "exposures, noise and poses that are slightly off), a radiance field is fitted to the photos, and not for long, and "
-            "cubes of its opacity become inputs. The signed distance of the room gives the labels. This page is written by "
-            "`python benchmarks/harvest_page.py`.",
+            "looks like it. So the larger part of the training pairs is *harvested*: a synthetic room of known "
+            f"geometry is photographed along a casual sweep ({config.photos[0]}–{config.photos[1]} small photos with "
+            "wrong exposures, noise and poses that are slightly off), a radiance field is fitted to the photos, and "
+            "not for long, and cubes of its opacity become inputs. The signed distance of the room gives the labels. "
+            "This page is written by `python benchmarks/harvest_page.py`.",
             "",
             f"**This one**: {found['pairs']:,} pairs of {found['scenes']} scenes{asked}{time}. "
             f"Fields (kind, cells along an axis): {kinds}. PSNR on their own photos: {middle:.1f} dB (one in ten below "
@@ -190,10 +190,11 @@ def page(options: Options, found: dict[str, Any], sample_bytes: int) -> str:
             "",
             "![six pairs, one a row](harvest/pairs.png)",
             "",
-            "Grey is true surface, **orange** a ghost, **blue** surface that the field lacks, violet what nobody judges: "
-            "inside solids and walls, the band about a surface, what no photo saw. A slice is the middle one along "
-            "z; opacities are drawn as their square roots, so that thin fog shows. `surroundings` is the same centre at "
-            "three times the edge; `views` counts the photos that have a voxel in their frustum, hidden or not.",
+            "Grey is true surface, **orange** a ghost, **blue** surface that the field lacks, violet what nobody "
+            "judges: inside solids and walls, the band about a surface, what no photo saw. A slice is the middle one "
+            "along z; opacities are drawn as their square roots, so that thin fog shows. `surroundings` is the same "
+            "centre at three times the edge; `views` counts the photos that have a voxel in their frustum, hidden or "
+            "not.",
             "",
             f"[A sample](harvest/sample) of {SAMPLE_CUBES} pairs ({sample_bytes / 1e6:.1f} MB, scenes without meshes) "
             "is in the repository: `unghost preview docs/harvest/sample`.",
