@@ -105,7 +105,7 @@ $(NERFSTUDIO)/.made:
 	@touch $@
 
 nerfstudio: $(NERFSTUDIO)/.made
-	$(NERFSTUDIO)/bin/python -W ignore benchmarks/nerfstudio_client.py $(ARGUMENTS)
+	$(NERFSTUDIO)/bin/python -W ignore -m benchmarks.integrations.nerfstudio $(ARGUMENTS)
 
 # nerfbaselines 1.2.12 wants numpy < 2, an OpenCV with a screen, and torch (only to see that it is there).
 $(NERFBASELINES)/.made:
@@ -118,7 +118,7 @@ $(NERFBASELINES)/.made:
 	@touch $@
 
 nerfbaselines: $(NERFBASELINES)/.made
-	$(NERFBASELINES)/bin/python -W ignore benchmarks/nerfbaselines_client.py $(ARGUMENTS)
+	$(NERFBASELINES)/bin/python -W ignore -m benchmarks.integrations.nerfbaselines $(ARGUMENTS)
 
 clean:
 	rm -rf build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -2,9 +2,10 @@
 
 A grid of displacements is laid over the trained field. Its Laplace approximation asks how much each training ray's
 colour would change if a node moved: nodes that may move freely are uncertain, and so is the density around them. The
-method needs no retraining and no prior. This is an independent implementation for any field of :mod:`.kinds`: the
-colour's derivative along a ray is written out (:func:`color_slopes`), that of density and colour in space is taken
-by central differences, so that a field need not be differentiable in its positions.
+method needs no retraining and no prior. This is an independent implementation for any field of
+:mod:`unghost.fields.kinds`: the colour's derivative along a ray is written out (:func:`color_slopes`), that of
+density and colour in space is taken by central differences, so that a field need not be differentiable in its
+positions.
 """
 
 from __future__ import annotations
@@ -19,10 +20,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..core.cameras import Cameras
-from .kinds import TrainableField
-from .radiance import CONTRACTED, contract
-from .rendering import Rendering, Sampling, render_rays
-from .training import gather_rays
+from ..fields.kinds import TrainableField
+from ..fields.radiance import CONTRACTED, contract
+from ..fields.rendering import Rendering, Sampling, render_rays
+from ..fields.training import gather_rays
 
 PRIOR = 1e-4  # lambda of the paper, divided by the number of cells
 STEP = 0.25  # of the central differences, in field cells
@@ -61,7 +62,7 @@ class DeformationUncertainty:
         return (0.5 * torch.log10(mean)).float().view(positions.shape[:-1])
 
     def keep(self, threshold: float) -> Keep:
-        """Which positions are certain enough: for :class:`~.filtered.FilteredField`.
+        """Which positions are certain enough: for :class:`unghost.fields.filtered.FilteredField`.
 
         Args:
             threshold: in (0, 1], a share of :attr:`highest`; 1 keeps everything.

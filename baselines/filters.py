@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from unghost.core.manifest import Manifest
-from unghost.core.occupancy import (
+from ..core.manifest import Manifest
+from ..core.occupancy import (
     DEFAULT_OPACITY_THRESHOLD,
     opacity_from_signed,
     signed_from_occupancy,
@@ -83,7 +83,9 @@ def total_variation(values: Values) -> Values:
     """Chambolle's, at a weight of .6 (not tuned)."""
     from skimage.restoration import denoise_tv_chambolle
 
-    result: Values = denoise_tv_chambolle(values.astype(np.float64), weight=0.6, max_num_iter=60).astype(np.float32)
+    result: Values = denoise_tv_chambolle(  # type: ignore[no-untyped-call]
+        values.astype(np.float64), weight=0.6, max_num_iter=60
+    ).astype(np.float32)
     return result
 
 

@@ -1,8 +1,8 @@
 """What others add to the photometric loss against floaters: pure, unreduced, each after its source.
 
-All take and give tensors; half precision is raised to float32 as in :mod:`.losses`, and to float64 where squares or
-long sums need it; :func:`scale_gradients` alone gives back what it got. Where a formula has a corner (the root of
-total variation at 0), the gradient there is 0, never NaN.
+All take and give tensors; half precision is raised to float32 as in :mod:`unghost.regularizer.losses`, and to float64
+where squares or long sums need it; :func:`scale_gradients` alone gives back what it got. Where a formula has a corner
+(the root of total variation at 0), the gradient there is 0, never NaN.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ try:
     import torch
     from torch import Tensor
 except ImportError as error:  # pragma: no cover - exercised in a subprocess
-    raise ImportError("unghost.regularizer.rivals needs torch: pip install unghost[torch]") from error
+    raise ImportError("unghost.baselines.losses needs torch: pip install unghost[torch]") from error
 
-from ..core.distortion import distortion
-from .losses import upcast, widest
+from ..core.arrays import upcast, widest
+from ..core.ray_distortion import distortion
 
 Squash = Literal["clamp", "sigmoid"]
 SIGMOID_SLOPE = 6.0  # of the scaled sigmoid at the threshold: within .005 of -1 at density 0 before it is rescaled
@@ -80,7 +80,7 @@ def depth_smoothness_loss(depth: Tensor) -> Tensor:
 
 
 def distortion_loss(weights: Tensor, edges: Tensor) -> Tensor:
-    """mip-NeRF 360, eq. 15, a ray: see :func:`unghost.core.distortion.distortion`.
+    """mip-NeRF 360, eq. 15, a ray: see :func:`unghost.core.ray_distortion.distortion`.
 
     Args:
         weights: ``(..., S)`` in [0, 1], adding up to at most 1.

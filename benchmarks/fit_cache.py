@@ -42,7 +42,7 @@ def file_hash(path: str | Path) -> str:
 
 def code_hash(*packages: Any) -> str:
     """Of every module in the packages' folders."""
-    files = [file for package in packages for file in sorted(Path(package.__file__).parent.glob("*.py"))]
+    files = [file for package in packages for file in sorted(Path(package.__file__).parent.rglob("*.py"))]
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:16]
 
 

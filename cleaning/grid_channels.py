@@ -20,11 +20,11 @@ from ..core.channels import (
     encode_view_count,
     pool_surroundings,
 )
-from ..core.cube_views import count_views, pinholes
 from ..core.frames import RESOLUTION, cube_lattices
 from ..core.occupancy import EMPTY
-from ..core.shards import SURROUNDINGS_RESOLUTION, TRANSMITTANCE_RESOLUTION
-from ..core.transmittance import DensityFn, TransmittanceMaps
+from ..core.shards.storage import SURROUNDINGS_RESOLUTION, TRANSMITTANCE_RESOLUTION
+from ..core.visibility.transmittance import DensityFn, TransmittanceMaps
+from ..core.visibility.view_counts import count_views, pinholes
 
 FloatGrid = NDArray[np.float32]
 FloatArray = NDArray[np.float64]

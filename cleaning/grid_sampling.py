@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.lattice import cells_within, lattice_axes
 from ..core.occupancy import EMPTY, OccupancyRule, check_density, warn_if_constant
 from .components import dilate
-from .keep_mask import cells_within, lattice_axes
 from .queries import Query
-from .windows import grow
+from .sliding_window import grow
 
 Mask = NDArray[np.bool_]
 Axes = list[NDArray[np.float64]]
@@ -87,7 +87,7 @@ def survey_field(
     """Ask the field where there may be something, slab by slab (along x), keeping a float32 and three bits a cell.
 
     Args:
-        query: of :func:`unghost.regularizer.queries.make_query`.
+        query: of :func:`unghost.cleaning.queries.make_query`.
         aabb: ``(2, 3)`` scene units; cells whose centre is outside count as empty.
         pitch: of the cells.
         shape: of the grid.

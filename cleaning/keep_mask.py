@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core.aabb import as_aabb
 from ..core.arrays import is_tensor, to_numpy
+from ..core.lattice import cells_within, lattice_axes, lattice_origin, look_up_cells
 from ..core.occupancy import check_density_shape
 
 FORMAT = "unghost-keep-mask"
@@ -187,33 +188,3 @@ class KeepMask:
             return cls(np.array(manifest["aabb"]), float(manifest["pitch"]), cells, dict(manifest["details"]))
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"KeepMask.load: {source}: {error}") from None
-
-
-def lattice_origin(aabb: NDArray[np.float64], pitch: float, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Lowest corner ``(3,)`` of ``shape`` cells of side ``pitch`` centred on the box."""
-    middle: NDArray[np.float64] = (aabb[0] + aabb[1]) / 2 - np.array(shape) * pitch / 2
-    return middle
-
-
-def look_up_cells(
-    cells: NDArray[Any], positions: NDArray[np.float64], *, aabb: NDArray[np.float64], pitch: float, outside: Any
-) -> NDArray[Any]:
-    """The value of the cell that holds each of ``positions (..., 3)``; ``outside`` where none does, or not finite."""
-    inside = ((positions >= aabb[0]) & (positions <= aabb[1])).all(axis=-1)
-    local = np.where(inside[..., None], positions - lattice_origin(aabb, pitch, cells.shape), 0.0)
-    index = np.clip(np.floor(local / pitch).astype(np.int64), 0, np.array(cells.shape) - 1)
-    values: NDArray[Any] = np.where(inside, cells[tuple(np.moveaxis(index, -1, 0))], outside)
-    return values
-
-
-def lattice_axes(aabb: NDArray[np.float64], pitch: float, shape: tuple[int, ...]) -> list[NDArray[np.float64]]:
-    """Coordinates of the cells' centres along each axis, scene units."""
-    origin = lattice_origin(aabb, pitch, shape)
-    return [origin[axis] + (np.arange(length) + 0.5) * pitch for axis, length in enumerate(shape)]
-
-
-def cells_within(axes: list[NDArray[np.float64]], box: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which cells ``(X, Y, Z)`` have their centre in a box ``(2, 3)``."""
-    x, y, z = ((axis >= low) & (axis <= high) for axis, low, high in zip(axes, box[0], box[1]))
-    within: NDArray[np.bool_] = x[:, None, None] & y[:, None] & z
-    return within

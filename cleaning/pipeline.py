@@ -14,17 +14,18 @@ from numpy.typing import ArrayLike, NDArray
 from ..core.aabb import as_aabb, scene_extent
 from ..core.arrays import is_tensor, to_numpy
 from ..core.cameras import Cameras, warn_if_turned_away
+from ..core.lattice import lattice_origin, look_up_cells
 from ..core.manifest import Denoiser
 from ..core.occupancy import OccupancyRule
 from ..core.schedule import check_timestep
-from ..core.transmittance import TransmittanceMaps
-from .context import GridContext, light_maps
-from .decide import decide, removed_regions
-from .denoise import check_denoiser
-from .keep_mask import KeepMask, lattice_origin, look_up_cells
+from ..core.visibility.transmittance import TransmittanceMaps
+from .denoiser_calls import check_denoiser
+from .grid_channels import GridContext, light_maps
+from .grid_sampling import Survey, survey_field
+from .keep_mask import KeepMask
+from .post_processing import decide, removed_regions
 from .queries import CHUNK, Backend, make_query
-from .survey import Survey, survey_field
-from .windows import Progress, grow, shrink, vote
+from .sliding_window import Progress, grow, shrink, vote
 
 Mask = NDArray[np.bool_]
 FloatGrid = NDArray[np.float32]
@@ -124,7 +125,7 @@ def clean(
     Overlapping windows of that grid, and of ones shrunk two times (the largest opacity of each block), go through
     the denoiser; a cell's score is the weighted mean of all that was predicted for it, and ``strength`` says below
     which score it is voted empty.
-    Connected pieces then have the last word: see :func:`unghost.regularizer.decide.decide`.
+    Connected pieces then have the last word: see :func:`unghost.cleaning.post_processing.decide`.
 
     Args:
         density_fn: ``positions (M, 3) float32 -> density (M, 1) or (M,)`` >= 0 per scene unit; arrays or tensors.

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from ..core.channels import stack_channels
 from ..core.manifest import Denoiser
 from ..core.occupancy import EMPTY
-from .context import GridContext
-from .denoise import BATCH, run_denoiser
+from .denoiser_calls import BATCH, run_denoiser
+from .grid_channels import GridContext
 
 FloatGrid = NDArray[np.float32]
 Mask = NDArray[np.bool_]

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .cleaning import clean
-from .fields.splat_ply import Gaussians, read_splat_ply, write_splat_ply
-from .fields.splats import SplatField
-from .regularizer.keep_mask import KeepMask
+from ..core.manifest import Denoiser
+from ..splats.density import SplatField
+from ..splats.ply import Gaussians, read_splat_ply, write_splat_ply
+from .keep_mask import KeepMask
+from .pipeline import clean
 
 SHARE = 0.98  # of the Gaussians' opacity, which the core of the scene holds along each axis
 REACH = 2.0  # times the core's sides: floaters hover about it, the far background is left as it is
@@ -72,7 +73,7 @@ def pitch_of(gaussians: Gaussians, aabb: NDArray[np.float64], resolution: int | 
 def clean_splats(
     gaussians: Gaussians,
     *,
-    denoiser: Any = None,
+    denoiser: Denoiser,
     resolution: int | None = None,
     reach: float = REACH,
     mask: KeepMask | None = None,
@@ -81,12 +82,12 @@ def clean_splats(
     """Decide which Gaussians to keep.
 
     Args:
-        gaussians: of :meth:`unghost.fields.splat_ply.SplatPly.gaussians`.
-        denoiser: from :func:`unghost.load_denoiser`; None for the shipped one.
+        gaussians: of :meth:`unghost.splats.ply.SplatPly.gaussians`.
+        denoiser: from :func:`unghost.load_denoiser`.
         resolution: cells along the box's longest side, >= 8: how fine the judgement is. None: by the splats' sizes.
         reach: of :func:`box_of`, >= 1; what is beyond stays.
         mask: of an earlier cleaning, to repeat it; None to judge.
-        **options: of :func:`unghost.clean`: ``strength``, ``keep_boxes``, ``cameras``, ``progress``, …
+        **options: of :func:`unghost.cleaning.clean`: ``strength``, ``keep_boxes``, ``cameras``, ``progress``, …
     """
     if resolution is not None and resolution < 8:
         raise ValueError(f"clean_splats: resolution must be >= 8, got {resolution}")

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .clean import Judgement
 from .keep_mask import KeepMask
+from .pipeline import Judgement
 
 STRENGTHS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
 
@@ -35,7 +35,7 @@ def choose_strength(
     soon as surfaces go. Hence not the best strength: the largest one whose error is within ``tolerance`` of the best.
 
     Args:
-        judgement: of :func:`unghost.regularizer.clean.judge`.
+        judgement: of :func:`unghost.cleaning.pipeline.judge`.
         error: what rendering the field cleaned by a mask gets wrong on photos from the training trajectory that
             were kept out of training: a mean squared error, say; >= 0, finite. Called once a strength.
         strengths: in [0, 1], at least one.

@@ -27,3 +27,22 @@ def to_numpy(array: Array) -> np.ndarray[Any, Any]:
         result: np.ndarray[Any, Any] = array.detach().cpu().numpy()
         return result
     return np.asarray(array)
+
+
+_HALF = ("torch.float16", "torch.bfloat16")
+
+
+def upcast(density: Any) -> Any:
+    """Convert a half-precision tensor to float32; leave float32 and float64 tensors as they are.
+
+    Raises:
+        TypeError: a tensor of integers or booleans.
+    """
+    if not density.is_floating_point():
+        raise TypeError(f"upcast: density must be a floating-point tensor, got {density.dtype}")
+    return density.float() if str(density.dtype) in _HALF else density
+
+
+def widest(tensor: Any) -> Any:
+    """Convert a tensor to float64, or to float32 on devices that have no float64 (mps)."""
+    return tensor.float() if tensor.device.type == "mps" else tensor.double()

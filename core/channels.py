@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from .arrays import Array, namespace
 from .frames import RESOLUTION, cube_lattices
 from .occupancy import EMPTY, OCCUPIED
-from .shards import MAX_VIEW_COUNT, SURROUNDINGS_EDGE, SURROUNDINGS_RESOLUTION
+from .shards.storage import MAX_VIEW_COUNT, SURROUNDINGS_EDGE, SURROUNDINGS_RESOLUTION
 
 Float32 = NDArray[np.float32]
 

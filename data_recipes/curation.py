@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from ..core.shards import read_shard, write_shard
+from ..core.shards.storage import read_shard, write_shard
 from .engines import WorkerDied, open_engine, spans
 from .folder_lock import locked
 from .pairs import Arrays, Chunk, Notes, SampleError, checked_root, close_meshes, damage, make_chunk, sample_pair
@@ -93,7 +93,7 @@ def _plans(recipe: Recipe, folder: Path, count: int, seed: int, root: str | None
     if root is None:
         base["licence"] = "generated"
     else:
-        from .mesh_sources import open_library
+        from .meshes.sources import open_library
 
         library = open_library(recipe, root)
         base |= {"meshes": len(library.entries), "mesh_manifest_sha256": library.manifest_sha256}

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.packing import dequantize_signed, unpack_labels
+from ..core.shards.packing import dequantize_signed, unpack_labels
 from .engines import LocalEngine, spans
 from .pairs import Chunk, checked_root, close_meshes, make_chunk
 from .recipe import Recipe
@@ -81,7 +81,7 @@ class OnlinePairs:
         self.recipe, self.seed, self.workers = recipe, seed, workers
         self._root = checked_root(recipe, mesh_root)
         if self._root is not None:
-            from .mesh_sources import open_library
+            from .meshes.sources import open_library
 
             open_library(recipe, self._root)  # what is wrong with the folder shows here, not in a worker
 

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from ..core.frames import CubeFrame
 from ..core.occupancy import FREE_LABEL, IGNORE_LABEL, SURFACE_LABEL, signed_from_occupancy
-from ..core.packing import pack_frame, pack_labels, quantize_signed
-from ..core.shards import ARRAYS, OPTIONAL_ARRAYS
-from .augment import corrupt, soften
-from .compose import dilate, sample_cube
+from ..core.shards.packing import pack_frame, pack_labels, quantize_signed
+from ..core.shards.storage import ARRAYS, OPTIONAL_ARRAYS
+from .corruptions.structured import corrupt, soften
 from .engines import spans
 from .recipe import Recipe
+from .solids.compose import dilate, sample_cube
 
 CUT_TOGETHER = 16  # cubes of one mesh
 SOFT_SKIRT = 1  # voxels
@@ -59,13 +59,13 @@ def _clean_cubes(
         drawn = [sample_cube(rng, recipe) for rng in rngs]
         return [CleanCube(rng, *cube, index) for rng, cube, index in zip(rngs, drawn, indices)], set()
     if recipe.source == "csg":
-        from .csg import csg_cubes_at
+        from .solids.csg import csg_cubes_at
 
         exact = csg_cubes_at(rngs, recipe, indices, seed)
         return [
             CleanCube(rng, cube, frame.edge_length, frame, group) for rng, (cube, frame, group) in zip(rngs, exact)
         ], set()
-    from .mesh_sources import open_library
+    from .meshes.sources import open_library
 
     assert mesh_root is not None
     cubes, passed = open_library(recipe, mesh_root).draw(rngs, indices, seed=seed)
@@ -175,7 +175,7 @@ def make_chunk(recipe: Recipe, seed: int, mesh_root: str | None, start: int, sto
             passed |= {row for i in range(low, high) for row in _named(arrays, start, recipe, i, seed, mesh_root)}
     if recipe.source != "meshes":
         return Chunk(arrays, {}, {})
-    from .mesh_sources import open_library
+    from .meshes.sources import open_library
 
     library = open_library(recipe, str(mesh_root))
     used = sorted(set(arrays["group"].tolist()))
@@ -185,6 +185,6 @@ def make_chunk(recipe: Recipe, seed: int, mesh_root: str | None, start: int, sto
 def close_meshes(root: str | None) -> None:
     """End the reader of meshes that one worker, this process, may have used."""
     if root is not None:
-        from .mesh_sources import close_libraries
+        from .meshes.sources import close_libraries
 
         close_libraries()

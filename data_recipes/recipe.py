@@ -10,14 +10,14 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from .primitives import FAMILIES
+from .solids.primitives import FAMILIES
 
 if sys.version_info >= (3, 11):
     import tomllib
 else:
     import tomli as tomllib
 
-BUILTIN_FOLDER = Path(__file__).parent
+BUILTIN_FOLDER = Path(__file__).parent / "recipes"
 SOURCES = ("procedural", "meshes", "csg")
 SPLITS = ("train", "val", "test")
 
@@ -38,7 +38,7 @@ class Recipe:
     Attributes:
         name: shown in provenance.
         source: ``"procedural"`` (signed distances), ``"meshes"`` (files) or ``"csg"`` (exact solids by boolean
-            trees, see :mod:`.csg`; needs manifold3d).
+            trees, see :mod:`.solids.csg`; needs manifold3d).
         edge_fraction: log, edge of a cube over the longest side of its object.
         families: primitive families to draw from; empty means all of them (``primitives.FAMILIES``).
         parts: log, how many solids one object has (rounded).

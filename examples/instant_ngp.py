@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from unghost import clean
-from unghost.core import signed_distance as sd
-from unghost.fields.instant_ngp import CELLS, SHORTEST_STEP, load_instant_ngp, morton_index
-from unghost.grids import cell_centers, save_grid
+from unghost.core.distances import signed as sd
+from unghost.fields.adapters.grids import cell_centers, save_grid
+from unghost.fields.adapters.instant_ngp import CELLS, SHORTEST_STEP, load_instant_ngp, morton_index
 
 
 def msgpack(value: object) -> bytes:

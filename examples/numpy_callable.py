@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 
 from unghost import clean
-from unghost.fields.callables import numpy_density_fn, occupancy_density_fn, transformed_density_fn
-from unghost.grids import cell_centers, grid_density_fn, load_grid, save_grid
+from unghost.fields.adapters.callables import numpy_density_fn, occupancy_density_fn, transformed_density_fn
+from unghost.fields.adapters.grids import cell_centers, grid_density_fn, load_grid, save_grid
 
 AABB = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])  # metres
 PITCH = 2.0 / 64

@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from unghost import clean
-from unghost.core import signed_distance as sd
-from unghost.fields.sdf_density import sdf_density_fn
-from unghost.grids import cell_centers
+from unghost.core.distances import signed as sd
+from unghost.fields.adapters.grids import cell_centers
+from unghost.fields.adapters.sdf import sdf_density_fn
 
 AABB = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
 CELLS = 64

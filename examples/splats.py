@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from unghost.fields.splat_ply import read_splat_ply
-from unghost.splat_cleaning import clean_ply
+from unghost.facade import clean_ply
+from unghost.splats.ply import read_splat_ply
 
 NAMES = [
     "x",

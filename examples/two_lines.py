@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from unghost import DensityRegularizer, load_denoiser
-from unghost.core import signed_distance as sd
+from unghost.core.distances import signed as sd
 
 AABB = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
 CELLS = 64

@@ -87,7 +87,8 @@ class OnnxDenoiser:
         """Open and check a file.
 
         Args:
-            path: of ``unghost.export.to_onnx.export_onnx`` or ``unghost.export.quantize.convert_onnx``: fp32, fp16
+            path: of ``unghost.export.onnx.to_onnx.export_onnx`` or ``unghost.export.onnx.quantization.convert_onnx``:
+            fp32, fp16
                 or int8 (``precision`` says which), all with float32 inputs and outputs.
             threads: of onnxruntime, inside operators; None leaves it the choice.
             providers: execution providers in order; None for CUDA where there is one, then the CPU.

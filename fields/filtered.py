@@ -16,7 +16,7 @@ class FilteredField:
 
     Args:
         field: what is filtered; shared, not copied.
-        keep: ``positions (M, 3) -> (M,)`` bool, as :meth:`unghost.regularizer.keep_mask.KeepMask.keep` is.
+        keep: ``positions (M, 3) -> (M,)`` bool, as :meth:`unghost.cleaning.keep_mask.KeepMask.keep` is.
     """
 
     def __init__(self, field: TrainableField, keep: Callable[[Tensor], Tensor]) -> None:

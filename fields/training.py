@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..core.cameras import Cameras
-from ..core.distortion import distortion
+from ..core.ray_distortion import distortion
 from .kinds import TrainableField
 from .rendering import Rendering, Sampling, render_rays
 

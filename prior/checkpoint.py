@@ -14,7 +14,7 @@ from torch import Tensor
 from ..core.channels import with_unknown
 from ..core.manifest import METADATA_KEY, Manifest
 from ..core.schedule import TIMESTEPS
-from .networks import AnyNetwork, build_network, config_from_dict
+from .networks.registry import AnyNetwork, build_network, config_from_dict
 
 CONFIG_KEY = "unghost_network"
 

@@ -10,8 +10,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ..cleaning.grid_channels import light_channel, light_maps, view_channel
 from ..core.aabb import contains
-from ..core.arrays import to_numpy
+from ..core.arrays import to_numpy, widest
 from ..core.cameras import Cameras
 from ..core.channels import (
     SURROUNDINGS,
@@ -23,10 +24,8 @@ from ..core.channels import (
     surroundings_lattice,
 )
 from ..core.occupancy import EMPTY, OccupancyRule
-from ..core.transmittance import TransmittanceMaps
-from .context import light_channel, light_maps, view_channel
+from ..core.visibility.transmittance import TransmittanceMaps
 from .cubes import CubeBatch
-from .losses import widest
 
 Ask = Callable[[Tensor], Tensor]
 

@@ -15,21 +15,21 @@ try:
     import torch
     from torch import Tensor
 except ImportError as error:  # pragma: no cover - exercised in a subprocess
-    raise ImportError("unghost.regularizer.regularizer needs torch: pip install unghost[torch]") from error
+    raise ImportError("unghost.regularizer.density_regularizer needs torch: pip install unghost[torch]") from error
 
+from ..cleaning.denoiser_calls import check_denoiser, run_denoiser
+from ..cleaning.grid_channels import viewing_cameras
+from ..cleaning.queries import field_device
 from ..core.aabb import as_aabb, scene_extent
-from ..core.arrays import to_numpy
+from ..core.arrays import to_numpy, upcast, widest
 from ..core.cameras import Cameras, warn_if_turned_away
 from ..core.manifest import Denoiser
 from ..core.occupancy import EMPTY, opacity_from_density, warn_if_constant
 from ..core.schedule import check_timestep
-from .context import viewing_cameras
-from .cube_context import FollowedRays, complete_channels, cube_surroundings
+from .cube_channels import FollowedRays, complete_channels, cube_surroundings
 from .cubes import CubeBatch, FieldPitch, draw_cubes, wide_dtype
-from .denoise import check_denoiser, run_denoiser
-from .losses import cube_parts, cubewise_mean, dsds_loss, stable_mean, upcast, visibility_loss, widest
+from .losses import cube_parts, cubewise_mean, dsds_loss, stable_mean, visibility_loss
 from .proposals import ImportanceGrid
-from .queries import field_device
 from .settings import SURE, RegularizerSettings
 from .tensor_queries import DensityFn, query_tensors
 from .visibility import ViewCounter, grow_box, visibility_points

@@ -16,19 +16,8 @@ try:
 except ImportError as error:  # pragma: no cover - exercised in a subprocess
     raise ImportError("unghost.regularizer.losses needs torch: pip install unghost[torch]") from error
 
+from ..core.arrays import upcast, widest
 from ..core.occupancy import DECISION
-
-
-def upcast(density: Tensor) -> Tensor:
-    """Half precision to float32; float32 and float64 as they are."""
-    if not density.is_floating_point():
-        raise TypeError(f"upcast: density must be a floating-point tensor, got {density.dtype}")
-    return density.float() if density.dtype in (torch.float16, torch.bfloat16) else density
-
-
-def widest(tensor: Tensor) -> Tensor:
-    """To float64, or float32 on devices that have no float64 (mps)."""
-    return tensor.float() if tensor.device.type == "mps" else tensor.double()
 
 
 def dsds_loss(

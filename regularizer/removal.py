@@ -14,9 +14,10 @@ try:
 except ImportError as error:  # pragma: no cover - exercised in a subprocess
     raise ImportError("unghost.regularizer.removal needs torch: pip install unghost[torch]") from error
 
-from .keep_mask import KeepMask
-from .losses import stable_mean, widest
-from .queries import field_device
+from ..cleaning.keep_mask import KeepMask
+from ..cleaning.queries import field_device
+from ..core.arrays import widest
+from .losses import stable_mean
 from .tensor_queries import DensityFn, query_tensors
 
 CALLER = "RemovalLoss"

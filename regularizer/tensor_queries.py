@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..core.arrays import upcast
 from ..core.occupancy import check_density, check_density_shape
-from .losses import upcast
 
 DensityFn = Callable[[Any], Any]
 

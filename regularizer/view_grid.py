@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.cameras import Cameras, distort, largest_radius, undistort
-from ..core.cube_views import BORDER_POINTS
+from ..core.visibility.view_counts import BORDER_POINTS
 
 MOST_TANGENTIAL = 0.05  # of p1, p2: beyond, a lens may fold where its radial terms do not tell
 COARSEST, LEVELS = 8, 3  # cells along an axis at first, and in how many sizes: down to 32 along it

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.distances.sampled import SampledDistance
 from ..core.frames import random_rotations
-from ..core.sampled_distance import SampledDistance
 from .solids import Solid, Texture
 
 Array = NDArray[Any]

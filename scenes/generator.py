@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.cameras import Cameras
-from ..core.sampled_distance import SampledDistance
+from ..core.distances.sampled import SampledDistance
 from .furniture import FURNITURE, box_solid, log_uniform, random_texture, sampled_object
 from .solids import Light, Solid, SolidScene
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import signed_distance as sd
+from ..core.distances import signed as sd
 
 Array = NDArray[Any]
 

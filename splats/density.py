@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .splat_ply import Gaussians
+from .ply import Gaussians
 
 CUT = 3.0  # standard deviations; beyond, a splat counts as nothing
 PAIRS = 1 << 19  # of a position and a splat that are looked at together: about 100 MB

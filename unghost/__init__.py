@@ -7,33 +7,29 @@ Importing this package loads nothing heavy: every name below arrives when it is 
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from . import _moved
+from .core.lazy import attach
 
 if TYPE_CHECKING:
-    from .cleaning import clean as clean
+    from .cleaning.keep_mask import KeepMask as KeepMask
     from .denoisers import load_denoiser as load_denoiser
-    from .regularizer.keep_mask import KeepMask as KeepMask
-    from .regularizer.regularizer import DensityRegularizer as DensityRegularizer
+    from .facade import clean as clean
+    from .regularizer.density_regularizer import DensityRegularizer as DensityRegularizer
 
 __version__ = "0.1.0"
-__all__ = ["DensityRegularizer", "KeepMask", "__version__", "clean", "load_denoiser"]
 
-_HOME = {
-    "DensityRegularizer": ".regularizer.regularizer",
-    "KeepMask": ".regularizer.keep_mask",
-    "clean": ".cleaning",
-    "load_denoiser": ".denoisers",
-}
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    {
+        ".cleaning.keep_mask": ["KeepMask"],
+        ".denoisers": ["load_denoiser"],
+        ".facade": ["clean"],
+        ".regularizer.density_regularizer": ["DensityRegularizer"],
+    },
+    extras={".regularizer.density_regularizer": "torch"},
+)
+__all__ += ["__version__"]
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module 'unghost' has no attribute {name!r}")
-    value = getattr(import_module(_HOME[name], __name__), name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *_HOME})
+_moved.install()

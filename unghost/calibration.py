@@ -9,7 +9,7 @@ import numpy as np
 
 if TYPE_CHECKING:
     from .core.manifest import Manifest
-    from .export.parity import ParityInputs
+    from .export.onnx.parity import ParityInputs
 
 
 def calibration_for(checkpoint: str | Path, source: str | Path, *, cubes: int, seed: int) -> ParityInputs:
@@ -25,7 +25,7 @@ def calibration_for(checkpoint: str | Path, source: str | Path, *, cubes: int, s
         FileNotFoundError: no such recipe.
         ValueError: an unreadable checkpoint or source.
     """
-    from .export.quantize import calibration_inputs
+    from .export.onnx.quantization import calibration_inputs
 
     if cubes < 1:
         raise ValueError(f"calibration_for: cubes must be >= 1, got {cubes}")
@@ -47,9 +47,9 @@ def _manifest(path: Path) -> Manifest:
 
 def _stored(folder: Path, cubes: int, names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Channels and edge fractions of cubes evenly spread over the shards of a folder."""
-    from .commands_prior import expand_shards
-    from .core.shards import read_shard
-    from .prior.batches import stored_channels
+    from .cli.training import expand_shards
+    from .core.shards.storage import read_shard
+    from .prior.training.batches import stored_channels
 
     shards = [read_shard(path) for path, _ in expand_shards(str(folder))]
     shares = [len(share) for share in np.array_split(np.arange(cubes), len(shards))]
@@ -61,7 +61,7 @@ def _stored(folder: Path, cubes: int, names: tuple[str, ...]) -> tuple[np.ndarra
 def _made(recipe: str | Path, cubes: int, seed: int, names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Channels (optional ones unknown) and edge fractions of the first cubes of a recipe."""
     from .core.channels import stack_channels
-    from .core.packing import dequantize_signed
+    from .core.shards.packing import dequantize_signed
     from .data_recipes.pairs import make_chunk
     from .data_recipes.recipe import load_recipe
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from .core.distances.signed import sphere
 from .core.frames import RESOLUTION, unit_lattice
-from .core.signed_distance import sphere
 
 WARM_UP = 3
 

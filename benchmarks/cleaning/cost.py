@@ -1,6 +1,6 @@
 """What `clean` costs: speed against error of its settings, empty space, and memory against the number of cameras.
 
-    python benchmarks/cleaning.py
+    python -m benchmarks.cleaning.cost
 
 Demo rooms that neither a threshold nor a picture has seen, every ghost labelled; a row for each setting that is
 changed from the defaults. Then the same room in a box twice as long whose other half is empty, with and without
@@ -19,19 +19,20 @@ from typing import Any
 
 import numpy as np
 import tyro
-from fit_cache import say
-from timing import median_seconds
 
 from unghost import load_denoiser
+from unghost.cleaning.pipeline import clean
 from unghost.core.cameras import Cameras
 from unghost.core.results import build_results, write_results
-from unghost.demo import score
-from unghost.demo_room import AABB, SHAPE, Room, build_room
+from unghost.demo.run import score
 from unghost.denoisers import shipped_names
-from unghost.grids import cell_centers, grid_density_fn
-from unghost.regularizer.clean import clean
+from unghost.fields.adapters.grids import cell_centers, grid_density_fn
+from unghost.scenes.labelled_room.room import AABB, SHAPE, Room, build_room
 
-ROOT = Path(__file__).resolve().parents[1]
+from ..fit_cache import say
+from ..timing import median_seconds
+
+ROOT = Path(__file__).resolve().parents[2]
 SETTINGS: dict[str, dict[str, Any]] = {
     "cells only": {"level_weights": (1.0,)},
     "twice the cell only": {"level_weights": (0.0, 1.0)},
@@ -135,9 +136,9 @@ def _most_memory(what: str, count: int, pipe: Any) -> None:
     if what == "clean":
         clean(field, AABB, denoiser=denoiser, field_pitch=room.pitch, cameras=cameras)
     else:
-        from grid_field import GridField
+        from unghost.regularizer.density_regularizer import DensityRegularizer
 
-        from unghost.regularizer.regularizer import DensityRegularizer
+        from ..regularizer.grid_field import GridField
 
         torch_field = GridField(room.density, room.pitch)
         regularizer = DensityRegularizer(denoiser, aabb=AABB, cameras=cameras, field_pitch=room.pitch)
@@ -178,7 +179,9 @@ def main() -> None:
         setting_row(f"clean, {method}", "default", rooms, options.threads, **SETTINGS[method]) for method in SETTINGS
     ]
     rows += [*empty_rows(rooms[0], options), *memory_rows()]
-    results = build_results(rows, command="python benchmarks/cleaning.py", seeds=options.seeds, threads=options.threads)
+    results = build_results(
+        rows, command="python -m benchmarks.cleaning.cost", seeds=options.seeds, threads=options.threads
+    )
     write_results(options.out / "cleaning.json", results)
 
 

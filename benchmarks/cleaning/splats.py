@@ -1,8 +1,8 @@
 """Floaters among 3D Gaussian splats: `unghost clean` beside what people use today, on scenes whose floaters are known.
 
-    python benchmarks/splats.py --splats 500000
+    python -m benchmarks.cleaning.splats --splats 500000
 
-Rooms of procedural furniture (`fields/scenes.py`) are covered with flat splats, as a trainer leaves them; floaters
+Rooms of procedural furniture (`scenes/generator.py`) are covered with flat splats, as a trainer leaves them; floaters
 are added to the free space: blobs (clusters), haze (wide faint splats) and needles (long thin ones), and every
 Gaussian's origin is remembered. Rivals: Open3D's statistical and radius outlier removal (on the middles, with
 the parameters that people copy), a threshold on the opacity, and the largest component of an occupancy grid. Each row:
@@ -20,15 +20,17 @@ from typing import Any
 
 import numpy as np
 import tyro
-from fit_cache import say
 from numpy.typing import NDArray
 
+from unghost.cleaning.splats import box_of, pitch_of
 from unghost.core.results import build_results, write_results
-from unghost.fields.scenes import random_scene
-from unghost.fields.splat_ply import Gaussians
-from unghost.splat_cleaning import box_of, clean_splats, pitch_of
+from unghost.facade import clean_splats
+from unghost.scenes.generator import random_scene
+from unghost.splats.ply import Gaussians
 
-ROOT = Path(__file__).resolve().parents[1]
+from ..fit_cache import say
+
+ROOT = Path(__file__).resolve().parents[2]
 KINDS = ("surface", "blob", "haze", "needle")
 REFERENCE = 40_000  # splats of a scene whose sizes are as written in `make`
 Mask = NDArray[np.bool_]
@@ -230,7 +232,8 @@ def main() -> None:
         scene = make(seed, options)
         rows += [row_of(name, seed, scene) for name in METHODS]
     seeds = " ".join(map(str, options.seeds))
-    command = f"python benchmarks/splats.py --splats {options.splats} --floaters {options.floaters:g} --seeds {seeds}"
+    scenes = f"--splats {options.splats} --floaters {options.floaters:g}"
+    command = f"python -m benchmarks.cleaning.splats {scenes} --seeds {seeds}"
     results = build_results(rows, command=command, seeds=list(options.seeds), floaters=options.floaters)
     write_results(options.out / "splats.json", results)
 

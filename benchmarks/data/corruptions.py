@@ -1,7 +1,7 @@
 """Draw every family of corruption at growing severity, and write the page that shows and measures them.
 
-python benchmarks/corruptions.py                 docs/corruptions.md and docs/corruptions/*.png
-python benchmarks/corruptions.py --out FOLDER    the same under another folder than docs
+python -m benchmarks.data.corruptions                 docs/corruptions.md and docs/corruptions/*.png
+python -m benchmarks.data.corruptions --out FOLDER    the same under another folder than docs
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from unghost.core import signed_distance as sd
+from unghost.core.distances import signed as sd
 from unghost.core.frames import random_rotations, unit_lattice
 from unghost.core.occupancy import DEFAULT_OPACITY_THRESHOLD, opacity_from_signed
-from unghost.data_recipes.augment import CORRUPTIONS, corrupt
-from unghost.data_recipes.compose import dilate, sample_cube
+from unghost.data_recipes.corruptions.softening import soften
+from unghost.data_recipes.corruptions.structured import CORRUPTIONS, corrupt
+from unghost.data_recipes.inspection.drawing import GHOST, MISSING, SURFACE, UNJUDGED, render_cube
 from unghost.data_recipes.pairs import SOFT_SKIRT
 from unghost.data_recipes.recipe import Recipe
-from unghost.data_recipes.render import GHOST, MISSING, SURFACE, UNJUDGED, render_cube
-from unghost.data_recipes.soften import soften
+from unghost.data_recipes.solids.compose import dilate, sample_cube
 
 Occupancy = NDArray[np.bool_]
 Values = NDArray[Any]
 
-DOCS = Path(__file__).resolve().parents[1] / "docs"
+DOCS = Path(__file__).resolve().parents[2] / "docs"
 SEVERITIES = (0.1, 0.3, 0.5, 0.8, 1.0)
 WIDTH = 176  # pixels of one cube
 MEASURED = 24  # cubes behind each number of the table
@@ -57,8 +57,9 @@ IMITATES = {
 
 INTRODUCTION = f"""# Corruptions
 
-What recipes do to clean cubes so that a prior can learn to undo it: the families of `data_recipes/augment.py`, and
-`soften`, which makes opacities of bits. This page is written by `python benchmarks/corruptions.py`.
+What recipes do to clean cubes so that a prior can learn to undo it: the families of
+`data_recipes/corruptions/structured.py`, and `soften`, which makes opacities of bits. This page is written by `python
+-m benchmarks.data.corruptions`.
 
 **How to read the pictures.** Each is a cube of 32³ voxels seen from one corner. On the left the clean cube; then the
 same with growing severity and the same random numbers, so that what a family changes at one severity is part of what

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unghost.core.frames import RESOLUTION, CubeFrame, unit_lattice
-from unghost.data_recipes import compose, csg
-from unghost.data_recipes.crops import choose_frame, cut_cubes, sample_mesh_cubes
-from unghost.data_recipes.meshes import Mesh
+from unghost.data_recipes.meshes.crops import choose_frame, cut_cubes, sample_mesh_cubes
+from unghost.data_recipes.meshes.library import Mesh
+from unghost.data_recipes.meshes.voxels import voxelize_triangles_slowly
 from unghost.data_recipes.recipe import load_recipe
-from unghost.data_recipes.voxelize import voxelize_triangles_slowly
+from unghost.data_recipes.solids import compose, csg
 
 SEED = 3
 TOGETHER = 16

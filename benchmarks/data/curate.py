@@ -1,7 +1,7 @@
 """How fast cubes are made, beside slicing and voxelising with trimesh and beside open3d's voxel grid.
 
-    OMP_NUM_THREADS=1 python benchmarks/curate.py             (about four minutes on two idle cores)
-    OMP_NUM_THREADS=1 python benchmarks/curate.py --quick     (half a minute, for a look)
+    OMP_NUM_THREADS=1 python -m benchmarks.data.curate             (about four minutes on two idle cores)
+    OMP_NUM_THREADS=1 python -m benchmarks.data.curate --quick     (half a minute, for a look)
 
 Mesh rows cut cubes of a generated bumpy ball: edges log-uniform, from choosing where the cube lies to its packed
 bits, no corruption. ``mesh/trimesh`` slices the mesh at the six faces of the cube and voxelises the rest, as the
@@ -27,7 +27,13 @@ from typing import Any
 
 import numpy as np
 import tyro
-from curate_ways import (
+
+from unghost.core.results import build_results, write_results
+from unghost.data_recipes.meshes.crops import sample_mesh_cubes
+from unghost.data_recipes.meshes.library import Mesh
+from unghost.data_recipes.recipe import Recipe
+
+from .cube_makers import (
     FACES,
     RECIPE,
     SEED,
@@ -48,12 +54,7 @@ from curate_ways import (
     with_trimesh,
 )
 
-from unghost.core.results import build_results, write_results
-from unghost.data_recipes.crops import sample_mesh_cubes
-from unghost.data_recipes.meshes import Mesh
-from unghost.data_recipes.recipe import Recipe
-
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 SWEEP_FACES = (1_000, 4_000, 16_000, 70_000, 250_000, 1_000_000)
 SWEEP_EDGES = (0.01, 0.02, 0.04, 0.07, 0.1, 0.2)
 
@@ -205,7 +206,7 @@ def main(options: Options) -> list[dict[str, Any]]:
     check_solids(4 if options.quick else 16)
     rows = [measure(contender, options) for contender in CONTENDERS]
     rows += sweeps(options, max(TOGETHER, options.cubes // 16))
-    command = "python benchmarks/curate.py" + " --quick" * options.quick + f" --workers {options.workers}"
+    command = "python -m benchmarks.data.curate" + " --quick" * options.quick + f" --workers {options.workers}"
     options.out.mkdir(parents=True, exist_ok=True)
     write_results(options.out / "curate.json", build_results(rows, command=command, seeds=[SEED]))
     plot(rows, options.out / "curate.png")

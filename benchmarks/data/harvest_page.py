@@ -1,9 +1,10 @@
 """Show what a harvest is: a page with pictures, the statistics beside a real capture's, and a small sample.
 
-    python benchmarks/harvest_page.py out/harvest --seconds S --scenes N
+    python -m benchmarks.data.harvest_page out/harvest --seconds S --scenes N
 
 Writes docs/harvest.md and docs/harvest/pairs.png, and docs/harvest/sample: a shard of some fifty cubes of scenes
-without meshes (so that all of it is generated), for a look and for tests. Run benchmarks/harvest_statistics.py first.
+without meshes (so that all of it is generated), for a look and for tests. Run benchmarks/data/harvest_statistics.py
+first.
 """
 
 from __future__ import annotations
@@ -20,13 +21,13 @@ import tyro
 from numpy.typing import NDArray
 
 from unghost.core.occupancy import FREE_LABEL, SURFACE_LABEL, opacity_from_signed
-from unghost.core.packing import dequantize_signed, unpack_labels
-from unghost.core.shards import ARRAYS, Shard, read_shard, write_shard
-from unghost.data_recipes.harvest_config import HarvestConfig
-from unghost.data_recipes.preview import draw_pair, find_shards
-from unghost.data_recipes.render import GHOST, SURFACE, UNJUDGED
+from unghost.core.shards.packing import dequantize_signed, unpack_labels
+from unghost.core.shards.storage import ARRAYS, Shard, read_shard, write_shard
+from unghost.data_recipes.harvest.config import HarvestConfig
+from unghost.data_recipes.inspection.drawing import GHOST, SURFACE, UNJUDGED
+from unghost.data_recipes.inspection.preview import draw_pair, find_shards
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 SAMPLE_CUBES = 60  # 82 kB each
 SHOWN, WIDTH, GAP = 6, 192, 8
 HEADINGS = ("what the field shows", "the truth", "a slice: opacity", "labels", "surroundings", "views (white: 24+)")
@@ -175,7 +176,7 @@ def page(options: Options, found: dict[str, Any], sample_bytes: int) -> str:
             f"geometry is photographed along a casual sweep ({config.photos[0]}–{config.photos[1]} small photos with "
             "wrong exposures, noise and poses that are slightly off), a radiance field is fitted to the photos, and "
             "not for long, and cubes of its opacity become inputs. The signed distance of the room gives the labels. "
-            "This page is written by `python benchmarks/harvest_page.py`.",
+            "This page is written by `python -m benchmarks.data.harvest_page`.",
             "",
             f"**This one**: {found['pairs']:,} pairs of {found['scenes']} scenes{asked}{time}. "
             f"Fields (kind, cells along an axis): {kinds}. PSNR on their own photos: {middle:.1f} dB (one in ten below "
@@ -202,7 +203,8 @@ def page(options: Options, found: dict[str, Any], sample_bytes: int) -> str:
             "## Does it look like a real capture's field?",
             "",
             "Cubes of fields fitted to the first sweep of a real capture, cut as the harvest's are, against those of "
-            "the harvest and of the synthetic recipes. The distance (`unghost.data_recipes.statistics`) compares seven "
+            "the harvest and of the synthetic recipes. The distance "
+            "(`unghost.data_recipes.inspection.statistics`) compares seven "
             "features of the *input* alone: 0 for the same distributions, 1 at most.",
             "",
             *statistics_table(options.docs),

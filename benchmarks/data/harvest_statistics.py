@@ -1,13 +1,13 @@
 """Do training cubes look like those of a real capture's field? Statistics side by side, and one distance each.
 
-    python benchmarks/harvest_statistics.py CAPTURE --train trajectory_1 --better trajectory_3 \
+    python -m benchmarks.data.harvest_statistics CAPTURE --train trajectory_1 --better trajectory_3 \
         --harvest out/harvest --unseen out/harvest-mlp
 
 Sets: ``capture`` (fields of the capture, one a seed), ``harvest`` and its kinds of field, ``harvest-unseen-field`` (the
 kind held out), the built-in recipes (``procedural`` as bits and as soft opacities, ``meshes`` if a folder is given),
 ``rooms``, and every family of corruption alone, on procedural cubes. The distance is that of
-``unghost.data_recipes.statistics``: in [0, 1], over what a cube's *input* shows; agreement with the truth stands
-beside it. Writes ``statistics.json`` and ``statistics.png``.
+``unghost.data_recipes.inspection.statistics``: in [0, 1], over what a cube's *input* shows; agreement with the truth
+stands beside it. Writes ``statistics.json`` and ``statistics.png``.
 """
 
 from __future__ import annotations
@@ -22,21 +22,17 @@ from typing import Any
 
 import numpy as np
 import tyro
-from capture_cubes import capture_shards, cubes_folder
-from fit_cache import say
 
 from unghost.core.occupancy import signed_from_occupancy
-from unghost.core.packing import quantize_signed
 from unghost.core.results import build_results, write_results
-from unghost.core.shards import read_shard
-from unghost.data_recipes.augment import CORRUPTIONS
-from unghost.data_recipes.curate import curate
-from unghost.data_recipes.harvest import harvest
-from unghost.data_recipes.harvest_config import HarvestConfig
-from unghost.data_recipes.pairs import make_chunk
-from unghost.data_recipes.preview import find_shards
-from unghost.data_recipes.recipe import Recipe, load_recipe
-from unghost.data_recipes.statistics import (
+from unghost.core.shards.packing import quantize_signed
+from unghost.core.shards.storage import read_shard
+from unghost.data_recipes.corruptions.structured import CORRUPTIONS
+from unghost.data_recipes.curation import curate
+from unghost.data_recipes.harvest.config import HarvestConfig
+from unghost.data_recipes.harvest.run import harvest
+from unghost.data_recipes.inspection.preview import find_shards
+from unghost.data_recipes.inspection.statistics import (
     FEATURES,
     CubeStatistics,
     cube_statistics,
@@ -44,8 +40,13 @@ from unghost.data_recipes.statistics import (
     sampling_floor,
     shard_statistics,
 )
+from unghost.data_recipes.pairs import make_chunk
+from unghost.data_recipes.recipe import Recipe, load_recipe
 
-ROOT = Path(__file__).resolve().parents[1]
+from ..denoise.capture_cubes import capture_shards, cubes_folder
+from ..fit_cache import say
+
+ROOT = Path(__file__).resolve().parents[2]
 SEED = 91
 ROOM_SCENES = 12
 
@@ -80,7 +81,7 @@ class Options:
 
     def command(self) -> str:
         """Without anybody's paths."""
-        parts = [f"python benchmarks/harvest_statistics.py {self.capture.resolve().name} --train {self.train}"]
+        parts = [f"python -m benchmarks.data.harvest_statistics {self.capture.resolve().name} --train {self.train}"]
         parts += [f"--better {' '.join(self.better)} --harvest {self.harvest.name} --cubes {self.cubes}"]
         parts += [f"--unseen {self.unseen.name}"] if self.unseen else []
         parts += ["--meshes MESHES"] if self.meshes else []

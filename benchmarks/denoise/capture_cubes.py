@@ -18,23 +18,24 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from capture import Options as CaptureOptions
-from capture import Sweep, fit_field, render
-from fit_cache import FitCache, code_hash, file_hash, say
 from numpy.typing import NDArray
 
 import unghost.fields
 from unghost.core.aabb import contains
 from unghost.core.cameras import Cameras
 from unghost.core.occupancy import FREE_LABEL, IGNORE_LABEL, SURFACE_LABEL
-from unghost.core.shards import write_shard
-from unghost.data_recipes import harvest as harvest_module
-from unghost.data_recipes import harvest_labels as labels_module
-from unghost.data_recipes.harvest import harvest_cubes
-from unghost.data_recipes.harvest_config import HarvestConfig
-from unghost.data_recipes.harvest_labels import BEHIND_BAND, FREE_BAND, SURFACE_BAND
-from unghost.evaluation.captures import load_capture
-from unghost.evaluation.protocol import optical_depth
+from unghost.core.shards.storage import write_shard
+from unghost.data_recipes.harvest import labels as labels_module
+from unghost.data_recipes.harvest import run as harvest_module
+from unghost.data_recipes.harvest.config import HarvestConfig
+from unghost.data_recipes.harvest.labels import BEHIND_BAND, FREE_BAND, SURFACE_BAND
+from unghost.data_recipes.harvest.run import harvest_cubes
+from unghost.evaluation.captures.loading import load_capture
+from unghost.evaluation.scoring.protocol import optical_depth
+
+from ..fit_cache import FitCache, code_hash, file_hash, say
+from ..two_trajectory.real_capture import Options as CaptureOptions
+from ..two_trajectory.real_capture import Sweep, fit_field, render
 
 STEPS = 360  # of fitting a field, as in docs/results/capture.json
 VOTES = 2

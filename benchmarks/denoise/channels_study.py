@@ -1,10 +1,10 @@
 """What should the network see? The same network, data, steps and seed, with more and more channels; one table.
 
-    python benchmarks/channels_study.py out/procedural=.25 out/meshes=.25 out/harvest=.5 --runs out/channels \\
+    python -m benchmarks.denoise.channels_study out/procedural=.25 out/meshes=.25 out/harvest=.5 --runs out/channels \\
         --meshes MESHES --harvest out/harvest-val --unseen out/harvest-mlp --capture CAPTURE
 
 A bit (opacity over .1), the opacity, then surroundings, view counts and transmittance on top. Each is trained from
-scratch and scored on the sets of ``denoise.py``; what has optional channels is scored once more with all of them
+scratch and scored on the sets of ``run.py``; what has optional channels is scored once more with all of them
 unknown (``blind``). Training resumes where it was killed. Writes docs/results/channels.json.
 """
 
@@ -18,23 +18,24 @@ from typing import Any
 
 import numpy as np
 import tyro
-from denoise import Options as Measurement
-from denoise import all_sets, mean_over_severities, row_of
-from denoise_sets import MIXED, CubeSet, blind
-from fit_cache import say
 
 from unghost import load_denoiser
-from unghost.commands_prior import expand_shards
+from unghost.cli.training import expand_shards
 from unghost.core.channels import CHANNEL_NAMES, SIGNED_OPACITY, SURROUNDINGS, TRANSMITTANCE, VIEW_COUNT
 from unghost.core.occupancy import DEFAULT_OPACITY_THRESHOLD, opacity_from_signed, signed_from_occupancy
-from unghost.core.packing import dequantize_signed, quantize_signed
 from unghost.core.results import build_results, write_results
-from unghost.core.shards import Shard, read_shard, write_shard
-from unghost.prior.config import TrainConfig
-from unghost.prior.network import SIZES
-from unghost.prior.train import train
+from unghost.core.shards.packing import dequantize_signed, quantize_signed
+from unghost.core.shards.storage import Shard, read_shard, write_shard
+from unghost.prior.networks.restoration import SIZES
+from unghost.prior.training.config import TrainConfig
+from unghost.prior.training.loop import train
 
-ROOT = Path(__file__).resolve().parents[1]
+from ..fit_cache import say
+from .run import Options as Measurement
+from .run import all_sets, mean_over_severities, row_of
+from .sets import MIXED, CubeSet, blind
+
+ROOT = Path(__file__).resolve().parents[2]
 FOG = ("harvest", "harvest-unseen-field", "capture")
 BIT = "a bit"
 VARIANTS: dict[str, tuple[str, ...]] = {
@@ -93,7 +94,8 @@ class Options:
             if getattr(self, name)
         )
         return (
-            f"python benchmarks/channels_study.py {shards} --meshes {self.meshes.name}{sets} --steps {self.steps} "
+            f"python -m benchmarks.denoise.channels_study {shards} --meshes {self.meshes.name}{sets} --steps "
+            f"{self.steps} "
             f"--batch-size {self.batch_size} --size {self.size} --cubes {self.cubes}"
         )
 

@@ -1,13 +1,14 @@
 """The reference measurement: how well, and how fast, one denoising step restores cubes that nobody trained on.
 
-    python benchmarks/denoise.py --meshes MESHES --harvest out/harvest-val --unseen out/harvest-mlp --capture CAPTURE
+    python -m benchmarks.denoise.run --meshes MESHES --harvest out/harvest-val --unseen out/harvest-mlp --capture
+    CAPTURE
 
-Sets (``denoise_sets.py``): ``clean`` and ``synthetic`` (bits: cubes of meshes of the ``test`` split, every family of
+Sets (``sets.py``): ``clean`` and ``synthetic`` (bits: cubes of meshes of the ``test`` split, every family of
 corruption at five severities, and ``mixed`` as recipes have it), ``synthetic-soft``, ``harvest`` (fields fitted to
 scenes that were not trained on), ``harvest-unseen-field`` (of a kind not trained on) and ``capture`` (a real
 capture's field against its pseudo ground truth, ``capture_cubes.py``). Methods: the input as it is, classical filters
-(``classical.py``), every model named. Each model is scored at its default timestep; on ``mixed`` also at the best of
-a few; one that takes optional channels also without them (``NAME, blind``). Scores: ``denoise_scores.py``. Writes
+(``baselines/filters.py``), every model named. Each model is scored at its default timestep; on ``mixed`` also at the
+best of a few; one that takes optional channels also without them (``NAME, blind``). Scores: ``scores.py``. Writes
 ``denoise.json`` and ``denoise.png``; finished rows are kept at once.
 """
 
@@ -20,21 +21,22 @@ from typing import Any, Literal
 
 import numpy as np
 import tyro
-from classical import Classical
-from denoise_figure import draw
-from denoise_scores import score
-from denoise_sets import MIXED, SEED, SEVERITIES, CubeSet, blind, capture_set, harvest_set, mesh_sets, tells_more
-from denoise_speed import UNTRAINED, Model, speed_row, untrained_rows
-from fit_cache import file_hash, say
 from numpy.typing import NDArray
 
 from unghost import load_denoiser
+from unghost.baselines.filters import Classical
 from unghost.core.arrays import to_numpy
 from unghost.core.channels import encode_known, stack_channels
-from unghost.core.packing import dequantize_share, dequantize_signed
 from unghost.core.results import build_results, write_results
+from unghost.core.shards.packing import dequantize_share, dequantize_signed
 
-ROOT = Path(__file__).resolve().parents[1]
+from ..fit_cache import file_hash, say
+from .figure import draw
+from .scores import score
+from .sets import MIXED, SEED, SEVERITIES, CubeSet, blind, capture_set, harvest_set, mesh_sets, tells_more
+from .speed import UNTRAINED, Model, speed_row, untrained_rows
+
+ROOT = Path(__file__).resolve().parents[2]
 WEIGHTS = ROOT / "unghost" / "weights"
 TIMESTEPS = (100, 300, 500, 700, 999)
 
@@ -71,7 +73,7 @@ class Options:
 
     def command(self) -> str:
         """Without anybody's paths."""
-        parts = [f"python benchmarks/denoise.py --meshes {self.meshes.name} --cubes {self.cubes}"]
+        parts = [f"python -m benchmarks.denoise.run --meshes {self.meshes.name} --cubes {self.cubes}"]
         for name in ("harvest", "unseen", "capture"):
             folder = getattr(self, name)
             parts += [f"--{name} {folder.resolve().name}"] if folder else []
@@ -155,7 +157,7 @@ def variants_of(name: str, denoiser: Any, timesteps: tuple[int, ...]) -> list[tu
     if denoiser.kind == "torch":
         import torch
 
-        from unghost.prior.noised_denoiser import NoisedDenoiser
+        from unghost.prior.diffusion.noised import NoisedDenoiser
 
         noised = NoisedDenoiser(denoiser, torch.Generator().manual_seed(SEED))
         found += [(f"{name}+noise@{step}", noised, step) for step in timesteps]

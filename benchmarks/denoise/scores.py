@@ -17,7 +17,7 @@ from unghost.core.occupancy import (
     SURFACE_LABEL,
     opacity_from_signed,
 )
-from unghost.prior.evaluate import KEPT, KeepCurve, masked_iou
+from unghost.prior.training.validation import KEPT, KeepCurve, masked_iou
 
 Predict = Callable[[NDArray[np.int64]], NDArray[np.float32]]
 

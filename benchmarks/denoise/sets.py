@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from capture_cubes import capture_shards, cubes_folder
 from numpy.typing import NDArray
 
 from unghost.core.occupancy import (
@@ -21,14 +20,16 @@ from unghost.core.occupancy import (
     signed_from_occupancy,
     signed_from_opacity,
 )
-from unghost.core.packing import dequantize_signed, unpack_labels
-from unghost.core.shards import Shard, read_shard
-from unghost.data_recipes.augment import CORRUPTIONS, corrupt
-from unghost.data_recipes.compose import dilate
-from unghost.data_recipes.curate import curate
-from unghost.data_recipes.preview import find_shards
+from unghost.core.shards.packing import dequantize_signed, unpack_labels
+from unghost.core.shards.storage import Shard, read_shard
+from unghost.data_recipes.corruptions.structured import CORRUPTIONS, corrupt
+from unghost.data_recipes.curation import curate
+from unghost.data_recipes.inspection.preview import find_shards
 from unghost.data_recipes.recipe import load_recipe
-from unghost.fields.sdf_density import laplace_density
+from unghost.data_recipes.solids.compose import dilate
+from unghost.fields.adapters.sdf import laplace_density
+
+from .capture_cubes import capture_shards, cubes_folder
 
 SEED = 77
 SEVERITIES = (0.1, 0.3, 0.5, 0.8, 1.0)

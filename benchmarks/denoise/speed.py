@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from fit_cache import say
-
 from unghost import load_denoiser
-from unghost.bench import measure_speed
 from unghost.core.manifest import Manifest
 from unghost.export.container import precision_of
+from unghost.speed import measure_speed
+
+from ..fit_cache import say
 
 BATCH, SECONDS = 40, 8.0
 UNTRAINED = ("unet-epsilon", "l")  # as `train_diffusion.py` and `unghost train --size` name them
@@ -96,12 +96,13 @@ def untrained_rows(names: tuple[str, ...], threads: int) -> list[dict[str, Any]]
 
 def _random_weights(name: str, checkpoint: Path) -> Path:
     import torch
-    from train_diffusion import RUNS
 
-    from unghost.export.to_onnx import export_onnx
+    from unghost.export.onnx.to_onnx import export_onnx
     from unghost.prior.checkpoint import save_model
-    from unghost.prior.network import SIZES
-    from unghost.prior.networks import build_network, family, network_for, network_gflop
+    from unghost.prior.networks.registry import build_network, family, network_for, network_gflop
+    from unghost.prior.networks.restoration import SIZES
+
+    from ..release.train_diffusion import RUNS
 
     config = network_for(RUNS[name].objective, RUNS[name].network) if name in RUNS else SIZES[name]
     torch.manual_seed(0)

@@ -21,11 +21,11 @@ import numpy as np
 
 from unghost.core.cameras import Cameras
 from unghost.core.results import build_results, write_results
-from unghost.evaluation.nerfbaselines_protocol import MASKS_VARIABLE, PROTOCOLS, MaskedProtocol
-from unghost.evaluation.protocol import ray_depth
-from unghost.evaluation.pseudo import PseudoTruth, make_pseudo_truth
-from unghost.evaluation.scoring import score_scene
-from unghost.evaluation.views import Renders, Truth
+from unghost.evaluation.scoring.engine import score_scene
+from unghost.evaluation.scoring.protocol import ray_depth
+from unghost.evaluation.scoring.pseudo_truth import PseudoTruth, make_pseudo_truth
+from unghost.evaluation.scoring.views import Renders, Truth
+from unghost.integrations.nerfbaselines.protocol import MASKS_VARIABLE, PROTOCOLS, MaskedProtocol
 
 WIDTH, HEIGHT, FOCAL, WALL = 64, 48, 64.0, 4.0
 SHIFTS = (2.0, 2.6, 9.0)  # of the evaluation cameras; the last sees nothing that was seen

@@ -33,12 +33,12 @@ from nerfstudio.models.nerfacto import NerfactoModelConfig  # noqa: E402
 from PIL import Image  # noqa: E402
 
 from unghost.core.results import build_results, write_results  # noqa: E402
-from unghost.fields.scenes import PhotographedScene, photograph, random_scene  # noqa: E402
-from unghost.nerfstudio_model import UnghostNerfactoModelConfig, cameras_of  # noqa: E402
+from unghost.integrations.nerfstudio.model import UnghostNerfactoModelConfig, cameras_of  # noqa: E402
+from unghost.scenes.generator import PhotographedScene, photograph, random_scene  # noqa: E402
 
-LOADED_BY_IMPORT = [name for name in ("unghost.regularizer.regularizer", "onnxruntime") if name in sys.modules]
+LOADED_BY_IMPORT = [name for name in ("unghost.regularizer.density_regularizer", "onnxruntime") if name in sys.modules]
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 CUBES = 6  # of the paper's 40: a CPU asks three fields about each voxel
 BEND = {"k1": 0.03, "k2": -0.01, "p1": 0.001, "p2": -0.002}  # told to nerfstudio for the check of conventions alone
 
@@ -125,7 +125,7 @@ def train(config: NerfactoModelConfig, data: Any, images: torch.Tensor, steps: i
 
 def step_cost(model: Any, calls: int = 3) -> dict[str, float]:
     """Milliseconds that the regularizer adds to a step with the paper's 40 cubes on all three fields, and at rest."""
-    from unghost.regularizer.regularizer import DensityRegularizer
+    from unghost.regularizer.density_regularizer import DensityRegularizer
 
     first, seconds = model.regularizer, []
     full = DensityRegularizer(first.denoiser, aabb=first.aabb, cameras=first.cameras)
@@ -200,7 +200,7 @@ def main() -> None:
     from importlib.metadata import version
 
     about = {name: version(name) for name in ("nerfstudio", "nerfacc", "torch", "viser", "tyro", "protobuf")}
-    command = f"python benchmarks/nerfstudio_client.py --steps {options.steps} --rays {options.rays}"
+    command = f"python -m benchmarks.integrations.nerfstudio --steps {options.steps} --rays {options.rays}"
     results = build_results(
         rows,
         command=command,

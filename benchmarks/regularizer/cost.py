@@ -1,14 +1,14 @@
 """What the regularizer costs: a step of score distillation, and the question which points no camera sees.
 
-    python benchmarks/regularizer.py CAPTURE
+    python -m benchmarks.regularizer.cost CAPTURE
 
 A step: 40 cubes of 32^3 of a fixed field (a room as a trilinear grid), with the shipped priors and with the paper's
 U-Net (random weights: its time does not depend on them) in the same harness; the field's own answers are timed apart.
 Visibility: 131,072 points in the box of a capture's cameras (its real, distorted lenses): every camera's exact test,
 the way of nerfstudio's published visibility field (pinholes, float32, 50 cameras at a time in one batched matrix
 product; our own writing of it), and ours with and without the cells that settle most points. Filling: holes torn into
-a room (``regularizer_fill.py``). What a step of our own field's training costs with it, on the capture's photos
-(``regularizer_overhead.py``). Writes docs/results/regularizer.json.
+a room (``filling.py``). What a step of our own field's training costs with it, on the capture's photos
+(``overhead.py``). Writes docs/results/regularizer.json.
 """
 
 from __future__ import annotations
@@ -22,28 +22,29 @@ from typing import Any
 import numpy as np
 import torch
 import tyro
-from fit_cache import say
-from grid_field import GridField
 from numpy.typing import NDArray
-from regularizer_fill import fill_row
-from regularizer_overhead import overhead_rows
-from timing import median_seconds
 
 from unghost import load_denoiser
 from unghost.core.cameras import Cameras
 from unghost.core.manifest import Manifest
 from unghost.core.results import build_results, write_results
-from unghost.demo_room import AABB, build_room
 from unghost.denoisers import shipped_names
-from unghost.evaluation.captures import load_capture
+from unghost.evaluation.captures.loading import load_capture
 from unghost.prior.checkpoint import TorchDenoiser
-from unghost.prior.networks import build_network
-from unghost.prior.unet import UNetConfig
-from unghost.regularizer.regularizer import DensityRegularizer
+from unghost.prior.networks.registry import build_network
+from unghost.prior.networks.unet import UNetConfig
+from unghost.regularizer.density_regularizer import DensityRegularizer
 from unghost.regularizer.view_grid import ViewGrid
 from unghost.regularizer.visibility import ViewCounter
+from unghost.scenes.labelled_room.room import AABB, build_room
 
-ROOT = Path(__file__).resolve().parents[1]
+from ..fit_cache import say
+from ..timing import median_seconds
+from .filling import fill_row
+from .grid_field import GridField
+from .overhead import overhead_rows
+
+ROOT = Path(__file__).resolve().parents[2]
 POINTS = 131_072
 FILLING = ("default", "views")
 UNET = "the paper's U-Net"
@@ -187,7 +188,7 @@ def main() -> None:
     rows = [*visibility_rows(options), *step_rows(options)]
     rows += [fill_row(name, steps=options.fill_steps, target=target) for target in (None, 0.9) for name in FILLING]
     rows += overhead_rows(options.capture, "default", threads=options.threads)
-    command = f"python benchmarks/regularizer.py {options.capture.resolve().name}"
+    command = f"python -m benchmarks.regularizer.cost {options.capture.resolve().name}"
     write_results(
         options.out / "regularizer.json", build_results(rows, command=command, seeds=[0], threads=options.threads)
     )

@@ -7,15 +7,16 @@ from typing import Any
 
 import numpy as np
 import torch
-from fit_cache import say
-from grid_field import GridField
 from numpy.typing import NDArray
 
 from unghost import load_denoiser
 from unghost.core.occupancy import OccupancyRule
-from unghost.demo_room import AABB, SHAPE, Room, build_room
-from unghost.grids import cell_centers
-from unghost.regularizer.regularizer import DensityRegularizer
+from unghost.fields.adapters.grids import cell_centers
+from unghost.regularizer.density_regularizer import DensityRegularizer
+from unghost.scenes.labelled_room.room import AABB, SHAPE, Room, build_room
+
+from ..fit_cache import say
+from .grid_field import GridField
 
 RULE = OccupancyRule()
 Mask = NDArray[np.bool_]

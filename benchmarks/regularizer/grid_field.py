@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from unghost.demo_room import AABB
 from unghost.fields.trilinear import trilinear
+from unghost.scenes.labelled_room.room import AABB
 
 
 class GridField(torch.nn.Module):

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from unghost.regularizer.losses import cubewise_mean, dsds_loss, stable_mean
-from unghost.regularizer.rivals import (
+from unghost.baselines.losses import (
     depth_smoothness_loss,
     distortion_loss,
     free_space_loss,
@@ -21,6 +20,7 @@ from unghost.regularizer.rivals import (
     squash_density,
     total_variation_loss,
 )
+from unghost.regularizer.losses import cubewise_mean, dsds_loss, stable_mean
 
 SINGLE = (torch.float32,)
 BRAIN = (torch.float32, torch.bfloat16)

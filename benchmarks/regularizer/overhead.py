@@ -7,13 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from fit_cache import say, training_hooks
 
 from unghost import load_denoiser
-from unghost.evaluation.captures import load_capture
+from unghost.evaluation.captures.loading import load_capture
 from unghost.fields.radiance import RadianceField
 from unghost.fields.training import train_field
-from unghost.regularizer.regularizer import DensityRegularizer
+from unghost.regularizer.density_regularizer import DensityRegularizer
+
+from ..fit_cache import say, training_hooks
 
 WARM, STEPS, DOWNSCALE = 60, 30, 8
 WAYS: dict[str, dict[str, Any] | None] = {

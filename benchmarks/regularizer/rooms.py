@@ -1,10 +1,10 @@
 """Score distillation on fields of rooms whose geometry is known: what it takes, what it leaves, what it puts there.
 
-    python benchmarks/dsds_rooms.py
+    python -m benchmarks.regularizer.rooms
 
-Rooms of the harvest's kind (``fields/scenes.py``, a seed of their own) are photographed as casually, fitted by a dense
-grid, and fine-tuned: alone, with the visibility loss, and with score distillation beside it. Labels are those of the
-harvest, at random points of the box, by what is opaque before fine-tuning:
+Rooms of the harvest's kind (``scenes/generator.py``, a seed of their own) are photographed as casually, fitted by a
+dense grid, and fine-tuned: alone, with the visibility loss, and with score distillation beside it. Labels are those
+of the harvest, at random points of the box, by what is opaque before fine-tuning:
 
     ghosts_removed    of the ghosts, no longer opaque
     surface_kept      of the true surface, still opaque
@@ -27,20 +27,21 @@ from typing import Any
 import numpy as np
 import torch
 import tyro
-from fit_cache import say, training_hooks
 from numpy.typing import NDArray
 
 from unghost import load_denoiser
 from unghost.core.occupancy import FREE_LABEL, SURFACE_LABEL, OccupancyRule, opacity_from_density
 from unghost.core.results import build_results, write_results
-from unghost.data_recipes.harvest_labels import Truth
+from unghost.data_recipes.harvest.labels import Truth
 from unghost.fields.kinds import make_field
 from unghost.fields.rendering import Sampling, render_view
-from unghost.fields.scenes import observers, photograph, random_scene
 from unghost.fields.training import TrainingConfig, train_field
-from unghost.regularizer.regularizer import DensityRegularizer
+from unghost.regularizer.density_regularizer import DensityRegularizer
+from unghost.scenes.generator import observers, photograph, random_scene
 
-ROOT = Path(__file__).resolve().parents[1]
+from ..fit_cache import say, training_hooks
+
+ROOT = Path(__file__).resolve().parents[2]
 RULE = OccupancyRule()
 POINTS, VIEWS, WIDTH, NEAREST = 400_000, 8, 96, 0.05
 FEWEST = 0.1  # of the surface: with less of it opaque, a fit has failed
@@ -187,7 +188,7 @@ def main() -> None:
         for way, each in found.items()
     ]
     command = (
-        f"python benchmarks/dsds_rooms.py --rooms {' '.join(map(str, options.rooms))} --seed {options.seed} "
+        f"python -m benchmarks.regularizer.rooms --rooms {' '.join(map(str, options.rooms))} --seed {options.seed} "
         f"--resolution {options.resolution} --fit-steps {options.fit_steps} --steps {options.steps} "
         f"--cubes {options.cubes}"
     )

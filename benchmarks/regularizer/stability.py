@@ -1,9 +1,9 @@
 """What the regularizer and ``clean`` do with hostile numbers, and how far they are from float64.
 
 Prints the table of ``docs/stability.md``; every row checks the behaviour that it states. Those about a single loss are
-in ``stability_losses.py``.
+in ``losses.py``.
 
-    python benchmarks/stability.py
+    python -m benchmarks.regularizer.stability
 """
 
 from __future__ import annotations
@@ -14,15 +14,16 @@ from typing import Any
 
 import numpy as np
 import torch
-from stability_losses import BRAIN, LOSS_CASES, SINGLE, TYPES, Case, largest, refuses, relative, smallest
 
+from unghost.cleaning.pipeline import clean, judge
 from unghost.core.cameras import Cameras
 from unghost.core.manifest import Manifest
 from unghost.core.occupancy import OccupancyRule
-from unghost.regularizer.clean import clean, judge
+from unghost.regularizer.density_regularizer import DensityRegularizer
 from unghost.regularizer.losses import dsds_loss, stable_mean
-from unghost.regularizer.regularizer import DensityRegularizer
 from unghost.regularizer.visibility import ViewCounter
+
+from .losses import BRAIN, LOSS_CASES, SINGLE, TYPES, Case, largest, refuses, relative, smallest
 
 BOX = np.array([[-1.0] * 3, [1.0] * 3])
 PITCH = 0.0625

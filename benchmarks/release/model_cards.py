@@ -1,7 +1,7 @@
 """The model cards of the shipped priors, NAME.md beside the weights: scores and settings from their manifests and
 ``docs/results``. What is said of the data (``DATA``) and the limits is typed by hand.
 
-python benchmarks/model_card.py
+python -m benchmarks.release.model_cards
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from readme import ROOT, load, number, table
-
 from unghost.core.channels import VIEW_COUNT
 from unghost.core.manifest import Manifest
 from unghost.export.container import precision_of
 from unghost.export.runtime import read_manifest
-from unghost.prior.network import SIZES, RestorationNet, parameter_count
+from unghost.prior.networks.restoration import SIZES, RestorationNet, parameter_count
+
+from .readme import ROOT, load, number, table
 
 WEIGHTS = ROOT / "unghost" / "weights"
 CALLED = {"default": "unghost"}  # in the reference measurement
@@ -185,7 +185,8 @@ def card(name: str, path: Path, manifest: Manifest) -> str:
         "",
         LICENCES,
         "",
-        "Scores above are of the reference measurement (`benchmarks/denoise.py`, docs/results/denoise.json), on what "
+        "Scores above are of the reference measurement (`benchmarks/denoise/run.py`, docs/results/denoise.json), "
+        "on what "
         "was not trained on: cubes of meshes of the `test` split, of fields fitted to scenes 128 to 139 of the "
         "harvest's seed (129 and 134 were watched while it trained; nothing was chosen by them), of MLP fields, of a "
         "real capture's field. Ghosts removed: one threshold for a set.",

@@ -1,7 +1,7 @@
 """The README's results: every number in that section is read from ``docs/results`` and from nowhere else.
 
-python benchmarks/readme.py           writes the section anew
-python benchmarks/readme.py --check   exit status 1 if it is not what the results say
+python -m benchmarks.release.readme           writes the section anew
+python -m benchmarks.release.readme --check   exit status 1 if it is not what the results say
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parents[1]
-BEGIN, END = "<!-- results: written by benchmarks/readme.py -->", "<!-- end of results -->"
+ROOT = Path(__file__).resolve().parents[2]
+BEGIN, END = "<!-- results: written by benchmarks/release/readme.py -->", "<!-- end of results -->"
 Row = dict[str, Any]
 
 
@@ -35,7 +35,7 @@ def demo(results: dict[str, Any]) -> list[str]:
     keys = ("floater_recall", "floater_precision", "surface_kept", "iou_before", "iou")
     rows = [[row["method"], *(number(row[key]) for key in keys), number(row["seconds"], 1)] for row in results["rows"]]
     head = ("method", "ghosts removed", "of what was removed, ghosts", "surface kept", "IoU before", "after", "seconds")
-    said = "The prior's removal threshold was chosen on other rooms of this kind (`benchmarks/ship.py`)."
+    said = "The prior's removal threshold was chosen on other rooms of this kind (`benchmarks/release/ship.py`)."
     return ["**The demo's room** (`make demo`; every ghost labelled):", "", *table(head, rows), "", said]
 
 

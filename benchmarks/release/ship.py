@@ -1,7 +1,7 @@
 """Make a trained model one of the shipped ones: choose its removal threshold, store and export it.
 
-    python benchmarks/ship.py out/run/model.safetensors default
-    python benchmarks/ship.py out/other/model.safetensors m --half
+    python -m benchmarks.release.ship out/run/model.safetensors default
+    python -m benchmarks.release.ship out/other/model.safetensors m --half
 
 `clean` is run on demo rooms that are used for nothing else (the demo shows room 0), at every candidate. The
 largest one that keeps the wanted share of the surface, mean over the rooms, goes into the manifest. How the
@@ -23,16 +23,16 @@ import numpy as np
 import tyro
 
 from unghost import load_denoiser
+from unghost.cleaning.pipeline import clean
 from unghost.core.results import build_results, write_results
-from unghost.demo import score
-from unghost.demo_room import AABB, SHAPE, build_room
+from unghost.demo.run import score
 from unghost.denoisers import WEIGHTS
-from unghost.export.quantize import export_precisions
-from unghost.grids import cell_centers, grid_density_fn
+from unghost.export.onnx.quantization import export_precisions
+from unghost.fields.adapters.grids import cell_centers, grid_density_fn
 from unghost.prior.checkpoint import load_model, save_model
-from unghost.regularizer.clean import clean
+from unghost.scenes.labelled_room.room import AABB, SHAPE, build_room
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 CANDIDATES = tuple(tenth / 10 for tenth in range(-6, 10))
 
 
@@ -112,7 +112,9 @@ def written(options: Options, folder: Path, threshold: float) -> dict[str, Path]
 def record(options: Options, rows: list[dict[str, Any]]) -> None:
     """The candidates and their scores, one file a model."""
     rooms, half = " ".join(map(str, options.rooms)), " --half" if options.half else ""
-    command = f"python benchmarks/ship.py {options.checkpoint.name} {options.name}{half} --kept {options.kept:g}"
+    command = (
+        f"python -m benchmarks.release.ship {options.checkpoint.name} {options.name}{half} --kept {options.kept:g}"
+    )
     results = build_results(rows, command=f"{command} --rooms {rooms}", seeds=options.rooms, kept=options.kept)
     write_results(options.out / f"threshold_{options.name}.json", results)
 

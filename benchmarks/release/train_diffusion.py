@@ -1,8 +1,9 @@
 """Train the diffusions that the comparison needs, one after the other, each for the same time or number of steps.
 
-python benchmarks/train_diffusion.py SHARDS [SHARDS ...] --out RUNS --minutes 60
-python benchmarks/train_diffusion.py SHARDS --out RUNS --minutes 240 --which unet-epsilon --device cuda
-python benchmarks/train_diffusion.py SHARDS --out RUNS --steps 40 --batch-size 4        a look at whether they learn
+python -m benchmarks.release.train_diffusion SHARDS [SHARDS ...] --out RUNS --minutes 60
+python -m benchmarks.release.train_diffusion SHARDS --out RUNS --minutes 240 --which unet-epsilon --device cuda
+python -m benchmarks.release.train_diffusion SHARDS --out RUNS --steps 40 --batch-size 4        a look at whether they
+learn
 
 SHARDS is FOLDER or FOLDER=WEIGHT, a shard or a folder of shards. The compact runs differ from ``unghost train`` in
 nothing but the objective: network, batches, optimiser and budget are those of the restoration priors. A run that was
@@ -16,16 +17,16 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from unghost.commands_prior import expand_shards
-from unghost.prior.config import TrainConfig
-from unghost.prior.network import SIZES
-from unghost.prior.train import train
-from unghost.prior.unet import UNetConfig
+from unghost.cli.training import expand_shards
+from unghost.prior.networks.restoration import SIZES
+from unghost.prior.networks.unet import UNetConfig
+from unghost.prior.training.config import TrainConfig
+from unghost.prior.training.loop import train
 
 ENDLESS = 10_000_000  # steps, where the time decides
 RUNS = {
     "compact-epsilon": TrainConfig(objective="epsilon"),
-    "small-epsilon": TrainConfig(objective="epsilon", network=SIZES["xs"]),  # what two_trajectory.py uses
+    "small-epsilon": TrainConfig(objective="epsilon", network=SIZES["xs"]),  # what the two-trajectory benchmark uses
     "compact-x0": TrainConfig(objective="x0"),
     "compact-bernoulli": TrainConfig(objective="bernoulli"),
     "unet-epsilon": TrainConfig(objective="epsilon", network=UNetConfig(), batch_size=16, learning_rate=2e-4),

@@ -1,11 +1,11 @@
 """Does training wait for its data? Cubes a second of the loader alone, of the network alone, and of both together.
 
-    python benchmarks/training_speed.py out/harvest out/procedural
+    python -m benchmarks.release.training_speed out/harvest out/procedural
 
 The loader reads shards, draws symmetries and optical depths, unpacks labels and stacks the channels, as in
 ``unghost train``; the network learns from one batch again and again (forward, backward, AdamW, average). Each size is
 timed with the cube alone and with all channels, the first of them also before freed memory is kept
-(``prior/allocator.py``, as ``unghost train`` does). Writes docs/results/training_speed.json.
+(``prior/training/allocator.py``, as ``unghost train`` does). Writes docs/results/training_speed.json.
 """
 
 from __future__ import annotations
@@ -22,18 +22,19 @@ from typing import Any
 
 import torch
 import tyro
-from fit_cache import say
 
-from unghost.commands_prior import expand_shards
+from unghost.cli.training import expand_shards
 from unghost.core.channels import CHANNEL_NAMES
 from unghost.core.results import build_results, write_results
-from unghost.prior.allocator import keep_freed_memory
-from unghost.prior.batches import Mixture
-from unghost.prior.config import TrainConfig
-from unghost.prior.network import SIZES
-from unghost.prior.trainer import Trainer
+from unghost.prior.networks.restoration import SIZES
+from unghost.prior.training.allocator import keep_freed_memory
+from unghost.prior.training.batches import Mixture
+from unghost.prior.training.config import TrainConfig
+from unghost.prior.training.run_state import Trainer
 
-ROOT = Path(__file__).resolve().parents[1]
+from ..fit_cache import say
+
+ROOT = Path(__file__).resolve().parents[2]
 WARM_UP = 3
 
 
@@ -111,7 +112,7 @@ def main() -> None:
     memory = "kept" if keep_freed_memory() else "returned"
     rows += [row_of(size, channels, options) | {"memory": memory} for size in options.sizes for channels in sets]
     folders = " ".join(Path(spec).name for spec in options.shards)
-    command = f"python benchmarks/training_speed.py {folders} --sizes {' '.join(options.sizes)}"
+    command = f"python -m benchmarks.release.training_speed {folders} --sizes {' '.join(options.sizes)}"
     results = build_results(rows, command=command, seeds=[0], threads=options.threads, batch_size=options.batch_size)
     write_results(options.out / "training_speed.json", results)
 

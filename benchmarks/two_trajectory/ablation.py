@@ -8,15 +8,16 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from trajectory_job import Job, Outcome, fine_tuned, make_regularizer
-from trajectory_methods import PAPER_PRIOR, paper, paper_timestep, restoration
 
 from unghost import load_denoiser
+from unghost.baselines.losses import Squash, sds_loss, squash_density
 from unghost.core.schedule import alphas_cumprod
 from unghost.fields.rendering import render_rays
 from unghost.regularizer.cubes import draw_cubes
-from unghost.regularizer.rivals import Squash, sds_loss, squash_density
 from unghost.regularizer.settings import RegularizerSettings
+
+from .job import Job, Outcome, fine_tuned, make_regularizer
+from .methods import PAPER_PRIOR, paper, paper_timestep, restoration
 
 POINTS_A_CELL = 1
 WEIGHT_RAYS = 1024  # of each training photo, whose weights fill the grid

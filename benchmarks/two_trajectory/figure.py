@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from trajectory_tables import COLORS, REFERENCE, Cell, finished, main_rows, score_at
+
+from .tables import COLORS, REFERENCE, Cell, finished, main_rows, score_at
 
 DRAWN = (
     "field",

@@ -11,14 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
-from trajectory_scenes import TrajectoryScene
 
 from unghost import load_denoiser
 from unghost.core.cameras import Cameras
 from unghost.fields.rendering import render_view
 from unghost.fields.training import TrainingConfig, train_field
-from unghost.regularizer.regularizer import DensityRegularizer
+from unghost.regularizer.density_regularizer import DensityRegularizer
 from unghost.regularizer.settings import RegularizerSettings
+
+from .scenes import TrajectoryScene
 
 REACH = 3.0  # how many times the box the visibility loss goes out to
 Views = dict[str, NDArray[Any]]
@@ -27,7 +28,7 @@ Term = Callable[[Any, int], Tensor]
 
 @dataclass(frozen=True)
 class Weights:
-    """Factors of the rivals' losses and their knobs, chosen on development scenes (``trajectory_sweep.py``).
+    """Factors of the rivals' losses and their knobs, chosen on development scenes (``sweep.py``).
 
     One rule for all: the smallest disparity error of those whose PSNR at equal coverage is within .1 dB of the best.
     """

@@ -14,19 +14,21 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from trajectory_job import Clock, Job, Outcome, Term, fine_tuned, make_regularizer, visibility
-from trajectory_rivals import free_space, regnerf, sparsity, total_variation
 
 from unghost import load_denoiser
+from unghost.baselines.bayes_rays import LOWEST, deformation_uncertainty
+from unghost.cleaning.components import label_components
+from unghost.cleaning.keep_mask import KeepMask
+from unghost.cleaning.pipeline import Judgement, judge
+from unghost.core.lattice import lattice_axes
 from unghost.fields.filtered import FilteredField
-from unghost.fields.uncertainty import LOWEST, deformation_uncertainty
-from unghost.regularizer.clean import Judgement, judge
-from unghost.regularizer.components import label_components
-from unghost.regularizer.keep_mask import KeepMask, lattice_axes
 from unghost.regularizer.removal import RemovalLoss
 from unghost.regularizer.settings import RegularizerSettings
 
-PAPER_PRIOR = Path(__file__).parent / "weights" / "small-epsilon.onnx"
+from .job import Clock, Job, Outcome, Term, fine_tuned, make_regularizer, visibility
+from .rivals import free_space, regnerf, sparsity, total_variation
+
+PAPER_PRIOR = Path(__file__).parents[1] / "weights" / "small-epsilon.onnx"
 PAPER_TIMESTEPS = (10, 50)
 UNCERTAINTY_THRESHOLDS = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # that of the weights stands in the tables
 UNCERTAINTY_RAYS = 1 << 16

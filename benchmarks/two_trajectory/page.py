@@ -1,6 +1,6 @@
 """``docs/results/README.md``: who wins the two-trajectory benchmark where, in tables and plain words.
 
-python benchmarks/trajectory_page.py            reads two_trajectory.json, writes the page and the figures
+python -m benchmarks.two_trajectory.page            reads two_trajectory.json, writes the page and the figures
 """
 
 from __future__ import annotations
@@ -12,14 +12,15 @@ from typing import Any
 
 import numpy as np
 from scipy.stats import sem, t
-from trajectory_figure import write_figures
-from trajectory_tables import KEYS, ORDERS, REFERENCE, finished, format_rows, main_rows, per_scene, summary_rows
 
-from unghost.evaluation.conventions import get_convention
-from unghost.evaluation.intervals import Interval
-from unghost.evaluation.report import convention_rows
+from unghost.evaluation.report.rows import convention_rows
+from unghost.evaluation.scoring.conventions import get_convention
+from unghost.evaluation.scoring.intervals import Interval
 
-ROOT = Path(__file__).resolve().parents[1]
+from .figure import write_figures
+from .tables import KEYS, ORDERS, REFERENCE, finished, format_rows, main_rows, per_scene, summary_rows
+
+ROOT = Path(__file__).resolve().parents[2]
 OURS = (
     "photo-doubt",
     "dsds-restoration",
@@ -136,7 +137,7 @@ PICTURES = {
 
 
 def picture_lines(folder: Path) -> list[str]:
-    """Those of ``trajectory_pictures.py`` that are there."""
+    """Those of ``pictures.py`` that are there."""
     there = {name: said for name, said in PICTURES.items() if (folder / name).exists()}
     return [line for name, said in there.items() for line in (f"{said}:", "", f"![{said.lower()}]({name})", "")]
 
@@ -315,7 +316,7 @@ def provenance(results: dict[str, Any]) -> list[str]:
     return [
         "## Where this is from",
         "",
-        "Written by `python benchmarks/trajectory_page.py` from two_trajectory.json, "
+        "Written by `python -m benchmarks.two_trajectory.page` from two_trajectory.json, "
         f"rows made at the commits {', '.join(commits)} by",
         "",
         "```",

@@ -1,6 +1,6 @@
 """What the methods of the two-trajectory benchmark look like: colour over depth, from the sweep that is scored.
 
-    python benchmarks/trajectory_pictures.py --scene room-0
+    python -m benchmarks.two_trajectory.pictures --scene room-0
 
 Fits and improves the field again (fits come from the benchmark's cache if they are there). Writes
 docs/results/two_trajectory_views.png, and two_trajectory_doubt.png: what the photos and the prior doubt of the field as
@@ -16,17 +16,18 @@ from typing import Any
 import numpy as np
 import torch
 import tyro
-from fit_cache import FitCache, say
-from trajectory_job import Job, Outcome, Views, render
-from trajectory_methods import METHODS, judged
-from trajectory_scores import SLACK, Stage
-from two_trajectory import Options as Benchmark
-from two_trajectory import fitted, stages
 
-from unghost.evaluation.report import draw_comparison
-from unghost.regularizer.photo_doubt import photo_doubt
+from unghost.evaluation.report.rows import draw_comparison
+from unghost.evaluation.uncertainty.photometric import photo_doubt
 
-ROOT = Path(__file__).resolve().parents[1]
+from ..fit_cache import FitCache, say
+from .job import Job, Outcome, Views, render
+from .methods import METHODS, judged
+from .run import Options as Benchmark
+from .run import fitted, stages
+from .scores import SLACK, Stage
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @dataclass(frozen=True)

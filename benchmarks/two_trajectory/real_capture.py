@@ -1,10 +1,10 @@
 """A real capture: does the prior take ghosts out of a field that was trained on one sweep of photos?
 
-    python benchmarks/capture.py CAPTURE --train trajectory_1 --eval trajectory_3
+    python -m benchmarks.two_trajectory.real_capture CAPTURE --train trajectory_1 --eval trajectory_3
 
 A field is fitted to the training sweep, a pseudo-ground-truth field to both. The first is then
 fine-tuned with (a) nothing more, (b) the visibility loss, (c) visibility and DSDS, for the same steps
-from the same seed, and each is scored on the evaluation sweep (``evaluation/protocol.py``). Writes
+from the same seed, and each is scored on the evaluation sweep (``evaluation/scoring/protocol.py``). Writes
 ``capture.json`` and ``capture.png``. Fitted fields and renderings are kept in ``--cache``, so that a
 run can be broken off and resumed, and other regularizer settings cost their own fine-tuning only.
 """
@@ -21,25 +21,26 @@ from typing import Any
 
 import numpy as np
 import tyro
-from fit_cache import FitCache, Plan, code_hash, file_hash, say, training_hooks
 from numpy.typing import NDArray
-from trajectory_scenes import Sweep
 
 import unghost.fields
 import unghost.regularizer
 from unghost import load_denoiser
 from unghost.core.cameras import Cameras
 from unghost.core.results import build_results, write_results
-from unghost.evaluation import protocol
-from unghost.evaluation.captures import load_capture
-from unghost.evaluation.report import draw_comparison, format_table, mean_over_seeds
+from unghost.evaluation.captures.loading import load_capture
+from unghost.evaluation.report.rows import draw_comparison, format_table, mean_over_seeds
+from unghost.evaluation.scoring import protocol
 from unghost.fields.radiance import RadianceConfig, RadianceField
 from unghost.fields.rendering import render_view
 from unghost.fields.training import train_field
-from unghost.regularizer.regularizer import DensityRegularizer
+from unghost.regularizer.density_regularizer import DensityRegularizer
 from unghost.regularizer.settings import RegularizerSettings
 
-ROOT = Path(__file__).resolve().parents[1]
+from ..fit_cache import FitCache, Plan, code_hash, file_hash, say, training_hooks
+from .scenes import Sweep
+
+ROOT = Path(__file__).resolve().parents[2]
 WITHOUT_PRIOR = {"field": "(a) fine-tuned alone", "visibility": "(b) + visibility"}
 FIGURE_VIEWS = 4
 Views = dict[str, NDArray[Any]]
@@ -86,7 +87,10 @@ class Options:
     def command(self) -> str:
         """The command that asks for the same numbers, without anybody's paths."""
         seeds = " ".join(map(str, self.seeds))
-        parts = [f"python benchmarks/capture.py {self.capture.resolve().name} --train {self.train} --eval {self.eval}"]
+        parts = [
+            f"python -m benchmarks.two_trajectory.real_capture {self.capture.resolve().name} --train {self.train} "
+            f"--eval {self.eval}"
+        ]
         parts += [f"--seeds {seeds} --downscale {self.downscale:g} --finetune-steps {self.finetune_steps}"]
         parts += [f"--seconds {self.seconds:g}" if self.steps is None else f"--steps {self.steps}"]
         parts += [f"--resolution {self.resolution}"] if self.resolution else []

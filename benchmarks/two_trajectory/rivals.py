@@ -7,16 +7,12 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from trajectory_job import Job, Term
 
+from unghost.baselines.losses import depth_smoothness_loss, free_space_loss, sparsity_loss, total_variation_loss
 from unghost.core.cameras import Cameras
 from unghost.fields.rendering import render_rays
-from unghost.regularizer.rivals import (
-    depth_smoothness_loss,
-    free_space_loss,
-    sparsity_loss,
-    total_variation_loss,
-)
+
+from .job import Job, Term
 
 SPARSITY_POINTS, FREE_POINTS, TV_CUBES, TV_SIDE, PATCHES, PATCH = 1 << 15, 1 << 17, 12, 17, 10, 8
 

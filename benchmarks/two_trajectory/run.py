@@ -1,18 +1,18 @@
 """The two-trajectory benchmark: who takes ghosts out, at equal coverage, on scenes of which everything is known?
 
-    python benchmarks/two_trajectory.py --capture CAPTURE      the whole: a night on two cores
-    python benchmarks/two_trajectory.py --short                two scenes, one seed, few steps: a quarter of an hour
-    python benchmarks/two_trajectory.py --scenes room-0 --methods field visibility
+    python -m benchmarks.two_trajectory.run --capture CAPTURE      the whole: a night on two cores
+    python -m benchmarks.two_trajectory.run --short                two scenes, one seed, few steps: a quarter of an hour
+    python -m benchmarks.two_trajectory.run --scenes room-0 --methods field visibility
 
-A field is fitted to one sweep of photos, every method improves it (``trajectory_methods.py``) for the same steps, and
+A field is fitted to one sweep of photos, every method improves it (``methods.py``) for the same steps, and
 each is scored on another sweep under the convention ``proper``, at its own coverage and cut to others, in several
-orders of pixels (``trajectory_scores.py``). Every finished row is saved at once in
+orders of pixels (``scores.py``). Every finished row is saved at once in
 ``docs/results/two_trajectory.json``; what is there is not done again, so that a run that was broken off goes on with
 the same command, and several processes may share the file, each with other scenes or seeds (with ``--threads 1``:
 means of seconds are over rows with the most threads). Knobs and the field of both sweeps are looked at on seed 0
 of the synthetic scenes alone.
 ``--equal-seconds`` trains for as long as ``visibility`` took (the median of the main table), ``--ablation`` does the
-paper's ablation, ``--every-eighth`` scores every 8th photo of the first sweep. The page: ``trajectory_page.py``.
+paper's ablation, ``--every-eighth`` scores every 8th photo of the first sweep. The page: ``page.py``.
 """
 
 from __future__ import annotations
@@ -31,24 +31,25 @@ from typing import Any
 import numpy as np
 import torch
 import tyro
-from fit_cache import FitCache, Plan, say
 from numpy.typing import NDArray
-from trajectory_ablation import ABLATION
-from trajectory_figure import write_figures
-from trajectory_job import Job, Outcome, Weights
-from trajectory_methods import FACTOR_OF, METHODS, UNTRAINED
-from trajectory_scenes import LabelledSpace, Sweep, TrajectoryScene, captured_scene, synthetic_scene
-from trajectory_scores import CONVENTION, Stage, scored
-from trajectory_tables import FEWER_SEEDS, REFERENCE, summary_rows
 
 from unghost.core.results import build_results, commit, write_results
-from unghost.evaluation.difficulty import difficulty_rows
-from unghost.evaluation.protocol import json_ready
+from unghost.evaluation.captures.difficulty import difficulty_rows
+from unghost.evaluation.scoring.protocol import json_ready
 from unghost.fields.radiance import RadianceConfig, RadianceField
 from unghost.fields.rendering import render_view
 from unghost.fields.training import TrainingConfig, train_field
 
-ROOT = Path(__file__).resolve().parents[1]
+from ..fit_cache import FitCache, Plan, say
+from .ablation import ABLATION
+from .figure import write_figures
+from .job import Job, Outcome, Weights
+from .methods import FACTOR_OF, METHODS, UNTRAINED
+from .scenes import LabelledSpace, Sweep, TrajectoryScene, captured_scene, synthetic_scene
+from .scores import CONVENTION, Stage, scored
+from .tables import FEWER_SEEDS, REFERENCE, summary_rows
+
+ROOT = Path(__file__).resolve().parents[2]
 SCENES = ("room-0", "room-1", "room-2", "room-5", "objects-4", "objects-27")
 SHORT_SCENES = ("room-1", "objects-4")
 
@@ -197,7 +198,7 @@ class Ledger:
 
     def write(self) -> None:
         """The file, with all means anew."""
-        command = " ".join(["python benchmarks/two_trajectory.py", *map(_without_folders, sys.argv[1:])])
+        command = " ".join(["python -m benchmarks.two_trajectory.run", *map(_without_folders, sys.argv[1:])])
         self.commands = [*(each for each in self.commands if each != command), command]
         seeds = sorted({cell["seed"] for cell in self.cells})
         results = build_results(

@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 
 from unghost.core.cameras import Cameras
 from unghost.core.occupancy import FREE_LABEL, SURFACE_LABEL, OccupancyRule, opacity_from_density
-from unghost.data_recipes.harvest_labels import Truth as Labels
-from unghost.evaluation.captures import load_capture
-from unghost.evaluation.conventions import SceneExtent
-from unghost.evaluation.difficulty import every_nth
-from unghost.evaluation.protocol import ray_depth
-from unghost.evaluation.pseudo import PseudoTruth, make_pseudo_truth
-from unghost.evaluation.views import Truth
+from unghost.data_recipes.harvest.labels import Truth as Labels
+from unghost.evaluation.captures.difficulty import every_nth
+from unghost.evaluation.captures.loading import load_capture
+from unghost.evaluation.scoring.conventions import SceneExtent
+from unghost.evaluation.scoring.protocol import ray_depth
+from unghost.evaluation.scoring.pseudo_truth import PseudoTruth, make_pseudo_truth
+from unghost.evaluation.scoring.views import Truth
 from unghost.fields.rendering import Sampling
-from unghost.fields.scenes import PhotographedScene, photograph, photograph_again, random_scene
+from unghost.scenes.generator import PhotographedScene, photograph, photograph_again, random_scene
 
 RULE = OccupancyRule()
 POINTS = 300_000  # at which labelled opacity is asked for

@@ -1,9 +1,10 @@
 """What a row of the two-trajectory benchmark says of one setting of a method: scores, curves over coverage, labels.
 
 A method gives up pixels in one of three orders: ``own``, by the method's own uncertainty; ``spread``, by how far the
-depth along the ray spreads, which any field can tell; ``photos``, by :func:`unghost.regularizer.photo_doubt`, which
-any field with the photos it was trained on can tell. A method without an uncertainty of its own has ``spread`` as own;
-ours have photo doubt times the root of how far the disparity spreads, the spread of the log depth per depth.
+depth along the ray spreads, which any field can tell; ``photos``, by
+:func:`unghost.evaluation.uncertainty.photometric`, which any field with the photos it was trained on can tell. A
+method without an uncertainty of its own has ``spread`` as own; ours have photo doubt times the root of how far the
+disparity spreads, the spread of the log depth per depth.
 """
 
 from __future__ import annotations
@@ -13,16 +14,17 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from trajectory_job import Clock, Outcome, Views, render
-from trajectory_scenes import LabelledSpace, TrajectoryScene
 
-from unghost.evaluation.conventions import evaluation_masks, get_convention
-from unghost.evaluation.curves import cut_to_coverage
-from unghost.evaluation.pseudo import PseudoTruth
-from unghost.evaluation.scoring import SceneScores, score_scene, score_under_all
-from unghost.evaluation.sparsification import sparsify
-from unghost.evaluation.views import Renders, Truth
-from unghost.regularizer.photo_doubt import photo_doubt
+from unghost.evaluation.scoring.conventions import evaluation_masks, get_convention
+from unghost.evaluation.scoring.curves import cut_to_coverage
+from unghost.evaluation.scoring.engine import SceneScores, score_scene, score_under_all
+from unghost.evaluation.scoring.pseudo_truth import PseudoTruth
+from unghost.evaluation.scoring.views import Renders, Truth
+from unghost.evaluation.uncertainty.photometric import photo_doubt
+from unghost.evaluation.uncertainty.sparsification import sparsify
+
+from .job import Clock, Outcome, Views, render
+from .scenes import LabelledSpace, TrajectoryScene
 
 CONVENTION = "proper"
 COVERAGES = (0.02, 0.05, *(round(0.05 * step, 2) for step in range(2, 20)))

@@ -1,12 +1,12 @@
 """How much should each rival's loss weigh? Every factor on development scenes, none of which the benchmark scores.
 
-    python benchmarks/trajectory_sweep.py
-    python benchmarks/trajectory_sweep.py --losses       tries nothing: chooses anew among what is there
+    python -m benchmarks.two_trajectory.sweep
+    python -m benchmarks.two_trajectory.sweep --losses       tries nothing: chooses anew among what is there
 
 All factors of a loss are cut to the lowest coverage among them; of those whose PSNR is there within .1 dB of the best,
 the one with the smallest disparity error is ``chosen``, mean over the scenes; what differs by less than .001 and .01 dB
 is a tie, and stays with the factor that is there. Writes
-docs/results/two_trajectory_sweep.json, off which ``Weights`` in ``trajectory_job.py`` is read; losses that are not
+docs/results/two_trajectory_sweep.json, off which ``Weights`` in ``job.py`` is read; losses that are not
 asked for stay there as they were.
 """
 
@@ -21,19 +21,20 @@ from typing import Any
 import numpy as np
 import torch
 import tyro
-from fit_cache import FitCache, say
-from trajectory_job import Job, Weights
-from trajectory_methods import FACTOR_OF, METHODS
-from trajectory_scenes import synthetic_scene
-from trajectory_scores import Stage, scored
-from trajectory_tables import summary_rows
-from two_trajectory import Options as Benchmark
-from two_trajectory import fitted
 
 from unghost.core.results import build_results, write_results
-from unghost.evaluation.protocol import json_ready
+from unghost.evaluation.scoring.protocol import json_ready
 
-ROOT = Path(__file__).resolve().parents[1]
+from ..fit_cache import FitCache, say
+from .job import Job, Weights
+from .methods import FACTOR_OF, METHODS
+from .run import Options as Benchmark
+from .run import fitted
+from .scenes import synthetic_scene
+from .scores import Stage, scored
+from .tables import summary_rows
+
+ROOT = Path(__file__).resolve().parents[2]
 FACTORS = {
     "sparsity": (1e-4, 1e-3, 1e-2, 1e-1),
     "tv": (1e-3, 1e-2, 1e-1, 1.0),
@@ -120,7 +121,7 @@ def main() -> None:
             f"{row['method']}: {row['psnr_at_coverage']:.3f} dB at {row['at_coverage']:.3f}, disparity "
             f"{row['disparity_mae_at_coverage']:.4f}{' *' * row['chosen']}"
         )
-    command = f"python benchmarks/trajectory_sweep.py --scenes {' '.join(options.scenes)}"
+    command = f"python -m benchmarks.two_trajectory.sweep --scenes {' '.join(options.scenes)}"
     named = " ".join(options.losses)
     if options.losses != tuple(FACTORS):
         command = " ; ".join([stored.get("command", ""), *([f"{command} --losses {named}"] if named else [])])

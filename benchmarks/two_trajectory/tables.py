@@ -4,7 +4,7 @@
 coverage among them, each at its own setting and in its own order of pixels; ``_by_spread`` and ``_by_photos``: all in
 that order; ``_at_best``: the setting of its knob and the order that are best for it there, which takes an eye on the
 truth. ``psnr_area`` and its like are means over all coverages from .1 up to that bar: one coverage is a moment of the
-race. Between two measured coverages a score is interpolated linearly (``evaluation/curves.py``).
+race. Between two measured coverages a score is interpolated linearly (``evaluation/scoring/curves.py``).
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from unghost.evaluation.curves import Curve
-from unghost.evaluation.intervals import bootstrap_scenes
+from unghost.evaluation.scoring.curves import Curve
+from unghost.evaluation.scoring.intervals import bootstrap_scenes
 
 KEYS = (
     "psnr",

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .frames import RESOLUTION, CubeFrame
-from .occupancy import IGNORE_LABEL
+from ..frames import RESOLUTION, CubeFrame
+from ..occupancy import IGNORE_LABEL
 
 VOXELS = RESOLUTION**3
 FRAME_NUMBERS = 13

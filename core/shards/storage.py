@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .frames import RESOLUTION
+from ..frames import RESOLUTION
 from .packing import FRAME_NUMBERS, VOXELS
 
 FORMAT = "unghost-shard"
@@ -123,8 +123,8 @@ def write_shard(folder: str | Path, arrays: Mapping[str, NDArray[Any]], provenan
             Optional: ``surroundings (N, 16, 16, 16) uint8`` (quantised signed opacity, same centre and rotation,
             three times the edge), ``view_count (N, 32, 32, 32) uint8`` (training views that saw a voxel, capped
             at 255), ``transmittance (N, 16, 16, 16) uint8`` (255 times the share of light that the best training
-            camera gets, see :mod:`.transmittance`), ``frames (N, 13) float64`` (:func:`pack_frame`),
-            ``source (N,) int32`` (a row of ``provenance["sources"]``, -1 for none).
+            camera gets, see :mod:`unghost.core.visibility.transmittance`), ``frames (N, 13) float64``
+            (:func:`pack_frame`), ``source (N,) int32`` (a row of ``provenance["sources"]``, -1 for none).
         provenance: JSON-able; kept in the manifest.
 
     Raises:

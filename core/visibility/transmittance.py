@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .cameras import Cameras
+from ..cameras import Cameras
 
 FAN = (32, 24)  # rays across and down a photo
 STEPS = 96  # samples along a ray

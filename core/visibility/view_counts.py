@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .cameras import Cameras, distort, largest_radius, undistort
-from .frames import RESOLUTION, cube_lattices, unit_lattice
-from .shards import MAX_VIEW_COUNT
+from ..cameras import Cameras, distort, largest_radius, undistort
+from ..frames import RESOLUTION, cube_lattices, unit_lattice
+from ..shards.storage import MAX_VIEW_COUNT
 
 BORDER_POINTS = 33  # along each side of an image, where a bent border is straightened
 

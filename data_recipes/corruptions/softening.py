@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.occupancy import opacity_from_density, signed_from_occupancy, signed_from_opacity
-from .draws import log_uniform
+from ...core.occupancy import opacity_from_density, signed_from_occupancy, signed_from_opacity
+from ..solids.draws import log_uniform
 
 ALIKE = 1 / 3  # of the soft cubes: ghosts as sharp and as opaque as the surface
 Grid = NDArray[np.float32]

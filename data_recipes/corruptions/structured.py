@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .compose import dilate
-from .primitives import log_uniform
-from .soften import coarse_noise, soften
+from ..solids.compose import dilate
+from ..solids.primitives import log_uniform
+from .softening import coarse_noise, soften
 
 __all__ = ["CORRUPTIONS", "changed_fraction", "coarse_noise", "corrupt", "soften"]
 

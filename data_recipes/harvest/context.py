@@ -1,4 +1,4 @@
-"""The opacity in and about a harvested cube (how many photos saw its voxels: :mod:`unghost.core.cube_views`)."""
+"""Opacity in and around a harvested cube; view counts come from :mod:`unghost.core.visibility.view_counts`."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.aabb import contains
-from ..core.channels import pool_surroundings, surroundings_lattice
-from ..core.occupancy import EMPTY, opacity_from_density, signed_from_opacity
+from ...core.aabb import contains
+from ...core.channels import pool_surroundings, surroundings_lattice
+from ...core.occupancy import EMPTY, opacity_from_density, signed_from_opacity
 
 DensityFn = Callable[[NDArray[Any]], NDArray[np.float32]]
 

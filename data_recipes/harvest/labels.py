@@ -17,15 +17,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.aabb import contains
-from ..core.cameras import Cameras
-from ..core.occupancy import (
-    DEFAULT_OPACITY_THRESHOLD,
-    FREE_LABEL,
-    IGNORE_LABEL,
-    SURFACE_LABEL,
-    opacity_from_signed,
-)
+from ...core.aabb import contains
+from ...core.cameras import Cameras
+from ...core.occupancy import DEFAULT_OPACITY_THRESHOLD, FREE_LABEL, IGNORE_LABEL, SURFACE_LABEL, opacity_from_signed
 
 HIDDEN = 0.05  # share of light from a place that no training camera gets more of
 Observers = tuple[Cameras, NDArray[np.float64]]
@@ -40,7 +34,7 @@ class Geometry(Protocol):
 
 
 class Photographed(Protocol):
-    """A scene and what its photos saw; :class:`unghost.fields.scenes.PhotographedScene` is one."""
+    """A scene and what its photos saw; :class:`unghost.scenes.generator.PhotographedScene` is one."""
 
     @property
     def scene(self) -> Geometry:

@@ -6,8 +6,8 @@ import dataclasses
 import json
 from pathlib import Path
 
-from ..core.shards import read_shard
-from .harvest_config import HarvestConfig
+from ...core.shards.storage import read_shard
+from .config import HarvestConfig
 
 
 def scene_folder(folder: str | Path, index: int) -> Path:
@@ -21,7 +21,7 @@ def finished(
     """Whether a scene is stored, its hashes checked.
 
     Args:
-        seed, index, config, fit: of the harvest, as :func:`.harvest.harvest` has them.
+        seed, index, config, fit: of the harvest, as :func:`.run.harvest` has them.
         meshes: whether it has a folder of meshes.
 
     Raises:

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.aabb import scene_extent
-from ..core.frames import RESOLUTION, CubeFrame, random_rotations
-from ..core.packing import pack_labels, quantize_signed
-from .harvest_config import HarvestConfig
-from .harvest_labels import Geometry
+from ...core.aabb import scene_extent
+from ...core.frames import RESOLUTION, CubeFrame, random_rotations
+from ...core.shards.packing import pack_labels, quantize_signed
+from .config import HarvestConfig
+from .labels import Geometry
 
 if TYPE_CHECKING:
-    from ..core.sampled_distance import SampledDistance
+    from ...core.distances.sampled import SampledDistance
 
 OBJECT_STREAM = 0x6F626A  # keeps the choice of meshes apart from a scene's own generator
 
@@ -26,7 +26,7 @@ def draw_objects_of(
     """The meshes of a scene, drawn apart from all else; none without a folder."""
     if mesh_root is None:
         return [], []
-    from .mesh_objects import draw_objects
+    from ..meshes.objects import draw_objects
 
     rng = np.random.default_rng([seed, index, OBJECT_STREAM])
     return draw_objects(rng, mesh_root, int(rng.integers(config.objects[0], config.objects[1] + 1)))
@@ -37,9 +37,9 @@ def room_cubes(rng: np.random.Generator, scene: Geometry, config: HarvestConfig)
 
     Whole rooms at the pitch of a field's cells: several things in a cube, thin legs, walls.
     """
-    from .compose import shell_from_distance
-    from .curate import damage
-    from .recipe import load_recipe
+    from ..curation import damage
+    from ..recipe import load_recipe
+    from ..solids.compose import shell_from_distance
 
     recipe, aabb = load_recipe("rooms"), np.array([[-1.0] * 3, [1.0] * 3])
     count = config.cubes

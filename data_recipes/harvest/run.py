@@ -1,8 +1,8 @@
 """Harvested pairs: cubes of badly constrained fields, beside the truth of the scenes they were fitted to.
 
 A radiance field of one of several kinds is fitted to a few photos of a synthetic scene, and not for long; cubes
-of its opacity are inputs, the scene's signed distance gives three-valued labels (see :mod:`.harvest_labels`).
-Each is stored with its surroundings, its frame, and how many photos saw each voxel (:mod:`.harvest_context`).
+of its opacity are inputs, the scene's signed distance gives three-valued labels (see :mod:`.labels`).
+Each is stored with its surroundings, its frame, and how many photos saw each voxel (:mod:`.context`).
 """
 
 from __future__ import annotations
@@ -17,12 +17,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.aabb import scene_extent
-from ..core.channels import full_channel
-from ..core.cube_views import count_views
-from ..core.frames import RESOLUTION, cube_lattices, random_rotations
-from ..core.occupancy import DEFAULT_OPACITY_THRESHOLD, opacity_from_density, opacity_from_signed
-from ..core.packing import (
+from ...core.aabb import scene_extent
+from ...core.channels import full_channel
+from ...core.frames import RESOLUTION, cube_lattices, random_rotations
+from ...core.occupancy import DEFAULT_OPACITY_THRESHOLD, opacity_from_density, opacity_from_signed
+from ...core.shards.packing import (
     dequantize_share,
     dequantize_signed,
     pack_labels,
@@ -30,20 +29,21 @@ from ..core.packing import (
     quantize_signed,
     unpack_labels,
 )
-from ..core.shards import TRANSMITTANCE_RESOLUTION, read_shard, write_shard
-from ..core.transmittance import TransmittanceMaps
-from .engines import LocalEngine
-from .folder_lock import locked
-from .harvest_config import HarvestConfig
-from .harvest_context import signed_opacity, surroundings
-from .harvest_labels import HIDDEN, Labeller, Truth, check_fit, severity_of
-from .harvest_resume import finished, scene_folder
-from .harvest_rooms import draw_objects_of, room_cubes
+from ...core.shards.storage import TRANSMITTANCE_RESOLUTION, read_shard, write_shard
+from ...core.visibility.transmittance import TransmittanceMaps
+from ...core.visibility.view_counts import count_views
+from ..engines import LocalEngine
+from ..folder_lock import locked
+from .config import HarvestConfig
+from .context import signed_opacity, surroundings
+from .labels import HIDDEN, Labeller, Truth, check_fit, severity_of
+from .resume import finished, scene_folder
+from .rooms import draw_objects_of, room_cubes
 
 if TYPE_CHECKING:
-    from ..core.sampled_distance import SampledDistance
-    from ..fields.kinds import TrainableField
-    from ..fields.scenes import PhotographedScene
+    from ...core.distances.sampled import SampledDistance
+    from ...fields.kinds import TrainableField
+    from ...scenes.generator import PhotographedScene
 
 OBSERVER_STREAM = 0x6F6273  # keeps the other sweep apart from all else
 EARLY = 0.45  # share of the fit at which the first cubes are taken
@@ -133,7 +133,7 @@ def harvest_cubes(
 def _photograph(
     rng: np.random.Generator, config: HarvestConfig, objects: Sequence[SampledDistance] = ()
 ) -> PhotographedScene:
-    from ..fields.scenes import photograph, random_scene
+    from ...scenes.generator import photograph, random_scene
 
     width = int(rng.integers(config.photo_width[0], config.photo_width[1] + 1))
     photos = int(rng.integers(config.photos[0], config.photos[1] + 1))
@@ -142,7 +142,7 @@ def _photograph(
 
 def _draw_field(rng: np.random.Generator, config: HarvestConfig) -> tuple[str, int, TrainableField]:
     """A fresh field: its kind, its resolution, and itself."""
-    from ..fields.kinds import make_field
+    from ...fields.kinds import make_field
 
     shares = np.array(config.shares) / np.sum(config.shares)
     kind = config.kinds[int(rng.choice(len(config.kinds), p=shares))]
@@ -158,11 +158,12 @@ def harvest_scene(
     """Build, photograph, fit and cut scene ``index``: shard arrays and provenance. Depends on (seed, index) alone.
 
     Scene ``index`` is the same room in the same photos whatever the kinds: a set that is held out needs its own seed.
-    With a folder of meshes, some of its ``train`` split stand among the furniture (:mod:`.mesh_objects`).
+    With a folder of meshes, some of its ``train`` split stand among the furniture
+    (:mod:`unghost.data_recipes.meshes.objects`).
     """
-    from ..fields.rendering import Sampling
-    from ..fields.scenes import observers
-    from ..fields.training import TrainingConfig, train_field
+    from ...fields.rendering import Sampling
+    from ...fields.training import TrainingConfig, train_field
+    from ...scenes.generator import observers
 
     rng = np.random.default_rng([seed, index])
     objects, meshes = draw_objects_of(seed, index, config, mesh_root)
@@ -217,8 +218,8 @@ def harvest_scene(
 def room_scene(
     seed: int, index: int, config: HarvestConfig, mesh_root: str | Path | None = None
 ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """Cubes of scene ``index`` without a field, see :func:`.harvest_rooms.room_cubes`; nothing is fitted."""
-    from ..fields.scenes import random_scene
+    """Cubes of scene ``index`` without a field, see :func:`.rooms.room_cubes`; nothing is fitted."""
+    from ...scenes.generator import random_scene
 
     rng = np.random.default_rng([seed, index, 1])
     objects, meshes = draw_objects_of(seed, index, config, mesh_root)
@@ -260,10 +261,10 @@ def harvest(
     """Harvest scenes ``first .. first + scenes - 1``, one shard each; those already there are checked and skipped.
 
     A run can be killed at any time and started again: it loses the scenes that it was at, one a worker. A worker that
-    dies costs the same. A second run in the same folder at the same time is refused (:mod:`.folder_lock`). Without
-    ``fit``, cubes are of perfect fields with synthetic corruption (:func:`room_scene`): quick, and needs no torch.
-    ``log`` hears of scenes that were given up. ``mesh_root`` is a folder of meshes with its manifest, for objects
-    beside the procedural ones.
+    dies costs the same. A second run in the same folder at the same time is refused
+    (:mod:`unghost.data_recipes.folder_lock`). Without ``fit``, cubes are of perfect fields with synthetic corruption
+    (:func:`room_scene`): quick, and needs no torch. ``log`` hears of scenes that were given up. ``mesh_root`` is a
+    folder of meshes with its manifest, for objects beside the procedural ones.
 
     Returns:
         The number of pairs now in ``out``.

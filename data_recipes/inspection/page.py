@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .render import GHOST, MISSING, SURFACE, UNJUDGED, Image, png_bytes
+from .drawing import GHOST, MISSING, SURFACE, UNJUDGED, Image, png_bytes
 from .statistics import CubeStatistics
 
 if TYPE_CHECKING:
@@ -227,7 +227,7 @@ def page_text(
     sources: Mapping[tuple[str, str], int],
     rejected: Mapping[str, str],
 ) -> str:
-    """The whole page; see :func:`unghost.data_recipes.preview.write_preview` for what it shows."""
+    """The whole page; see :func:`unghost.data_recipes.inspection.preview.write_preview` for what it shows."""
     keys = (
         (SURFACE, "true surface"),
         (GHOST, "ghost: the input is opaque where nothing is"),

@@ -12,24 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.occupancy import (
-    DEFAULT_OPACITY_THRESHOLD,
-    FREE_LABEL,
-    IGNORE_LABEL,
-    SURFACE_LABEL,
-    opacity_from_signed,
-)
-from ..core.packing import dequantize_signed, unpack_labels
-from ..core.shards import Shard, read_shard
-from .preview_page import page_text
-from .render import GHOST, MISSING, SURFACE, UNJUDGED, Image, best_turn, render_cube
-from .statistics import (
-    CubeStatistics,
-    cube_features,
-    feature_distances,
-    sampling_floor,
-    shard_statistics,
-)
+from ...core.occupancy import DEFAULT_OPACITY_THRESHOLD, FREE_LABEL, IGNORE_LABEL, SURFACE_LABEL, opacity_from_signed
+from ...core.shards.packing import dequantize_signed, unpack_labels
+from ...core.shards.storage import Shard, read_shard
+from .drawing import GHOST, MISSING, SURFACE, UNJUDGED, Image, best_turn, render_cube
+from .page import page_text
+from .statistics import CubeStatistics, cube_features, feature_distances, sampling_floor, shard_statistics
 
 MEASURED = 200  # cubes; about 15 ms each
 _PALETTE = np.zeros((3, 3), dtype=np.float32)

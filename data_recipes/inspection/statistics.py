@@ -40,10 +40,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core.frames import RESOLUTION
-from ..core.occupancy import DEFAULT_OPACITY_THRESHOLD, FREE_LABEL, IGNORE_LABEL, SURFACE_LABEL, opacity_from_signed
-from ..core.packing import dequantize_signed, quantize_signed, unpack_labels
-from ..core.shards import Shard, read_shard
+from ...core.frames import RESOLUTION
+from ...core.occupancy import DEFAULT_OPACITY_THRESHOLD, FREE_LABEL, IGNORE_LABEL, SURFACE_LABEL, opacity_from_signed
+from ...core.shards.packing import dequantize_signed, quantize_signed, unpack_labels
+from ...core.shards.storage import Shard, read_shard
 from .thickness import local_thickness
 
 Values = NDArray[np.float64]

@@ -11,7 +11,7 @@ from importlib.util import find_spec
 from xml.etree import ElementTree
 from xml.parsers import expat
 
-from .mesh_reading import Array, MeshRejected, no_triangles, trimesh_triangles
+from .reading import Array, MeshRejected, no_triangles, trimesh_triangles
 
 _REMOVED = frozenset(
     {

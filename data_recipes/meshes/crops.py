@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.frames import RESOLUTION, CubeFrame, random_rotations
-from .compose import draw_offset, random_dilation
-from .primitives import log_uniform
-from .recipe import Recipe
-from .voxelize import voxelize_batch
+from ...core.frames import RESOLUTION, CubeFrame, random_rotations
+from ..recipe import Recipe
+from ..solids.compose import draw_offset, random_dilation
+from ..solids.primitives import log_uniform
+from .voxels import voxelize_batch
 
 if TYPE_CHECKING:
-    from .meshes import Mesh
+    from .library import Mesh
 
 Array = NDArray[Any]
 Occupancy = NDArray[np.bool_]

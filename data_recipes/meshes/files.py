@@ -24,14 +24,14 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from .mesh_collada import check_xml, read_dae
-from .mesh_gltf import read_glb, read_gltf
-from .mesh_ply import read_ply
-from .mesh_reading import Array, MeshEmpty, MeshRejected, trimesh_triangles
-from .mesh_text import read_obj, read_off, read_stl
+from .collada import check_xml, read_dae
+from .gltf import read_glb, read_gltf
+from .ply import read_ply
+from .reading import Array, MeshEmpty, MeshRejected, trimesh_triangles
+from .text import read_obj, read_off, read_stl
 
 if TYPE_CHECKING:
-    from .meshes import Mesh
+    from .library import Mesh
 
 Side = Callable[[str], bytes]
 
@@ -125,14 +125,14 @@ def read_mesh_file(path: str | Path, *, root: str | Path | None = None) -> MeshF
 
 
 def load_mesh(path: str | Path) -> Mesh:
-    """Read a mesh file for cutting cubes of it: :func:`read_mesh_file` as a :class:`~.meshes.Mesh`.
+    """Read a mesh file for cutting cubes of it: :func:`read_mesh_file` as a :class:`~.library.Mesh`.
 
     Raises:
         FileNotFoundError: no such file.
         ImportError: trimesh is not installed.
         ValueError: empty or rejected; the message names the file and the reason.
     """
-    from .meshes import Mesh
+    from .library import Mesh
 
     source = Path(path)
     if not source.is_file():

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from .mesh_reading import Array, MeshRejected, no_triangles, trimesh_triangles
+from .reading import Array, MeshRejected, no_triangles, trimesh_triangles
 
 Side = Callable[[str], bytes]
 Json = dict[str, Any]

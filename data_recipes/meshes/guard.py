@@ -34,15 +34,15 @@ from typing import Any
 
 import numpy as np
 
-from .mesh_files import MOST_TRIANGLES, MeshFile, mesh_suffixes
-from .mesh_reading import Array
+from .files import MOST_TRIANGLES, MeshFile, mesh_suffixes
+from .reading import Array
 from .repair import RepairOptions
 
 LOADED, EMPTY, REJECTED = "loaded", "empty", "rejected"
 _MOST_RECORD = 1 << 20
 _START = (
     "import sys, json; sys.path[:] = json.loads(sys.argv[1]); "
-    "from unghost.data_recipes.guard_worker import main; main(int(sys.argv[2]), int(sys.argv[3]))"
+    "from unghost.data_recipes.meshes.worker import main; main(int(sys.argv[2]), int(sys.argv[3]))"
 )
 
 

@@ -1,4 +1,4 @@
-"""Meshes: normalised, chosen by licence and split; cubes cut from them. Files are read by :mod:`.mesh_files`."""
+"""Meshes: normalised, chosen by licence and split; cubes cut from them. Files are read by :mod:`.files`."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.frames import CubeFrame
+from ...core.frames import CubeFrame
+from ..recipe import Recipe
 from .box_tree import BoxTree
 from .crops import cut_cubes, sample_mesh_cubes
-from .recipe import Recipe
 
 Array = NDArray[Any]
 Occupancy = NDArray[np.bool_]

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.sampled_distance import SampledDistance
-from .mesh_sources import open_library
-from .recipe import load_recipe
+from ...core.distances.sampled import SampledDistance
+from ..recipe import load_recipe
+from .sources import open_library
 
 CELLS = 72  # along the longest side
 SKIN = 1.0  # half thickness of a face, in cells: less, and a thin sheet would have holes between the nodes

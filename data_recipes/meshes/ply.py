@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from .mesh_reading import Array, MeshRejected, triangulate
+from .reading import Array, MeshRejected, triangulate
 
 _TYPES = {
     "char": "i1",

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.frames import CubeFrame
+from ...core.frames import CubeFrame
 
 Array = NDArray[Any]
 Occupancy = NDArray[np.bool_]

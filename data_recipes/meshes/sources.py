@@ -18,12 +18,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.frames import CubeFrame
-from ..core.shards import stays_within
+from ...core.frames import CubeFrame
+from ...core.shards.storage import stays_within
+from ..recipe import Recipe
 from .crops import sample_mesh_cubes
 from .guard import GuardLimits, MeshGuard
-from .meshes import MANIFEST, Mesh, MeshEntry, read_manifest, select_meshes
-from .recipe import Recipe
+from .library import MANIFEST, Mesh, MeshEntry, read_manifest, select_meshes
 from .repair import RepairOptions
 
 MESH_STREAM = 0x6D657368  # keeps the order of meshes apart from the samples' own generators

@@ -10,7 +10,7 @@ import re
 
 import numpy as np
 
-from .mesh_reading import Array, MeshRejected, decode_text, no_triangles, triangulate, trimesh_triangles
+from .reading import Array, MeshRejected, decode_text, no_triangles, triangulate, trimesh_triangles
 
 _OBJ_SILENT = frozenset(
     {

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.frames import RESOLUTION
+from ...core.frames import RESOLUTION
 
 Array = NDArray[Any]
 Occupancy = NDArray[np.bool_]

@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from .mesh_files import MeshFile, normalise, read_mesh_file
-from .mesh_reading import MeshEmpty, MeshRejected
+from .files import MeshFile, normalise, read_mesh_file
+from .reading import MeshEmpty, MeshRejected
 from .repair import RepairOptions, repair_triangles
 
 _GRACE = 5.0  # seconds after the asker's limit at which an orphan ends itself

@@ -12,11 +12,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import signed_distance as sd
-from ..core.frames import RESOLUTION, CubeFrame, random_rotations
+from ...core.distances import signed as sd
+from ...core.frames import RESOLUTION, CubeFrame, random_rotations
+from ..recipe import Recipe
 from .narrow_band import shell_in_cube
 from .primitives import FAMILIES, Solid, log_uniform
-from .recipe import Recipe
 from .undulations import sine
 
 Array = NDArray[Any]

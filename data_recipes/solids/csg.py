@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.frames import CubeFrame, random_rotations
+from ...core.frames import CubeFrame, random_rotations
+from ..meshes.crops import choose_frame, cut_cubes
+from ..meshes.library import Mesh
+from ..meshes.repair import fill_solid
+from ..recipe import Recipe
 from .compose import random_dilation
-from .crops import choose_frame, cut_cubes
 from .draws import log_uniform, log_whole
-from .meshes import Mesh
-from .recipe import Recipe
-from .repair import fill_solid
 
 Array = NDArray[Any]
 Occupancy = NDArray[np.bool_]

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.frames import RESOLUTION, unit_lattice
+from ...core.frames import RESOLUTION, unit_lattice
 from .primitives import Solid
 
 Array = NDArray[Any]

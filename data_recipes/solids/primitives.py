@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..core import signed_distance as sd
+from ...core.distances import signed as sd
 from . import distances
 from .draws import Array, Family, Solid, log_uniform, log_whole
 from .undulations import leaf, rock, sponge, superquadric, terrain, twisted_bar

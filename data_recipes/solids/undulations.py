@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..core import signed_distance as sd
+from ...core.distances import signed as sd
 from .distances import total
 from .draws import Array, Solid, log_uniform
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.cameras import Cameras
+from ...core.cameras import Cameras
 from .difficulty import Difficulty, difficulty, every_nth, normalising_factor
 
 TRAIN_COLOUR, EVAL_COLOUR, LINK_COLOUR = "#1a1a1a", "#d62728", "#c9c9c9"
@@ -50,7 +50,7 @@ def draw_birds_eye(
     """Draw both sweeps from above and, beside them, what holding out every n-th training photo would test.
 
     A dot is a camera (black: training, red: scored), its tick the way it looks, a grey line the way from a scored one
-    to the nearest training one. Units as in :func:`~unghost.evaluation.difficulty.difficulty`.
+    to the nearest training one. Units as in :func:`~unghost.evaluation.captures.difficulty.difficulty`.
 
     Args:
         path: of the PNG.

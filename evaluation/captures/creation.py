@@ -9,12 +9,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from .captures import load_capture
 from .frames import Extraction, extract_frames
-from .nerfstudio_folder import file_lists, write_splits
+from .loading import load_capture
+from .nerfstudio import file_lists, write_splits
 from .new_folder import new_folder
 from .posing import Posing, PosingSettings, Progress, pose_jointly
-from .transforms_file import write_transforms
+from .transforms import write_transforms
 
 PREFIXES = {"train": "frame_", "eval": "frame_1_"}  # the names of the released Nerfbusters captures
 MODEL = "sparse/0"
@@ -40,7 +40,7 @@ def make_capture(
         out: must not exist, or be empty. Written whole or not at all.
         frames: at most so many are kept of each sweep.
         settings: of the posing.
-        progress: as in :func:`~unghost.evaluation.posing.pose_jointly`.
+        progress: as in :func:`~unghost.evaluation.captures.posing.pose_jointly`.
 
     Returns:
         what ``capture.json`` in the folder says: per sweep its ``source``, how many pictures it ``seen`` had, were

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.cameras import Cameras
+from ...core.cameras import Cameras
 
 TIE = 1e-9  # in normalised units: nearer than that is the same place
 TWO_SWEEPS = "the other sweep"

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.cameras import Cameras
+from ...core.cameras import Cameras
 from .colmap import find_model, read_model
 from .splits import Splits, resolve_splits
-from .transforms_file import read_frames, read_json, read_lens
+from .transforms import read_frames, read_json, read_lens
 
 MISSING = ("error", "drop")
 
@@ -127,7 +127,7 @@ def load_capture(
             rotated "up".
         splits: the sweeps, ``{"sweep": ["images/a.jpg", ...], ...}`` or a JSON file of that. None: ``splits.json`` in
             the folder, else nerfstudio's lists, else what the photos' names tell, else no sweep
-            (:func:`~unghost.evaluation.splits.resolve_splits`).
+            (:func:`~unghost.evaluation.captures.splits.resolve_splits`).
         missing: ``"error"``, or ``"drop"`` for photos that are not there: they are left out with a warning that
             counts them, and stand in ``Capture.dropped``.
         photos: folder that the photos' names refer to, if not ``folder`` (for COLMAP: ``images`` in it).

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .captures import Capture
+from .loading import Capture
 from .new_folder import new_folder
-from .transforms_file import write_transforms
+from .transforms import write_transforms
 
 PHOTOS = ("copy", "link")
 

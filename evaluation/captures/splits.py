@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .transforms_file import clean_name, first_twice, read_json
+from .transforms import clean_name, first_twice, read_json
 
 FILE_LISTS = {"train_filenames": "train", "val_filenames": "val", "test_filenames": "test"}
 TRAIN_NAMES, EVAL_NAMES = ("train",), ("eval", "test", "val")  # sweeps that are meant if none is named
@@ -121,7 +121,7 @@ def choose_split(
 
     Args:
         splits: of a capture, by name.
-        named: by the user; whether it is there, :meth:`~.captures.Capture.split` says.
+        named: by the user; whether it is there, :meth:`~.loading.Capture.split` says.
         usual: ``TRAIN_NAMES`` or ``EVAL_NAMES``.
         option: for the message.
         whole: a capture without any sweeps means all of it.

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.cameras import Cameras
+from ...core.cameras import Cameras
 
 DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
 LENS_KEYS = ("fl_x", "fl_y", "cx", "cy")

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.cameras import Cameras
+from ...core.cameras import Cameras
 from .checks import FloatArray, Mask, check_pair, picked
 
 NORMAL_THRESHOLD = 30.0  # degrees

@@ -17,16 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .checks import FloatArray, Mask, check_pair, check_range, choose, picked
-from .flip import PIXELS_PER_DEGREE, flip, flip_map
-from .geometry import (
-    NORMAL_THRESHOLD,
-    backproject,
-    depth_mse,
-    disparity_mae,
-    normal_errors,
-    normals_from_depth,
-)
-from .mask_scores import coverage, mask_scores, predicted_mask
+from .geometry import NORMAL_THRESHOLD, backproject, depth_mse, disparity_mae, normal_errors, normals_from_depth
+from .ldr_flip import PIXELS_PER_DEGREE, flip, flip_map
+from .masks import coverage, mask_scores, predicted_mask
 from .similarity import SSIM_CONVENTIONS, ssim, ssim_map
 
 __all__ = [

@@ -25,7 +25,7 @@ class SsimConvention:
 
     Attributes:
         premask: both images are set to 0 outside the mask before anything else.
-        border: what a window sees beyond the image, see :func:`unghost.evaluation.filters.correlate`;
+        border: what a window sees beyond the image, see :func:`unghost.evaluation.metrics.filters.correlate`;
             ``inside``: a window's weights are restricted to unmasked pixels and renormalised.
         over_mask: the map is averaged over unmasked pixels; else over all of them.
     """

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from .page_tables import text
+from .tables import text
 
 COLOURS = 8  # of the style sheet; further series are dashed
 WIDTH, HEIGHT = 560, 320

@@ -13,11 +13,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from .conventions import CONVENTIONS, PLAIN_CONVENTIONS
-from .page_charts import Series, colours_of, line_chart, swatch
-from .page_pictures import PHOTO, WORST, ViewPictures, wipe, worst_first
-from .page_style import SCRIPT, STYLE
-from .page_tables import (
+from ..scoring.conventions import CONVENTIONS, PLAIN_CONVENTIONS
+from .charts import Series, colours_of, line_chart, swatch
+from .pictures import PHOTO, WORST, ViewPictures, wipe, worst_first
+from .style import SCRIPT, STYLE
+from .tables import (
     EQUAL_KEYS,
     METRICS,
     OWN_KEYS,
@@ -41,8 +41,8 @@ def page_text(results: Mapping[str, Any], pictures: Sequence[ViewPictures] = ())
     Args:
         results: of the shape of :func:`unghost.core.results.build_results`. Of its rows every metric that is known is
             shown, grouped by convention; a ``curve`` is drawn; what
-            :func:`unghost.evaluation.comparison.compare_methods` adds is shown where it is there.
-        pictures: of :func:`unghost.evaluation.page_pictures.view_pictures`, in order.
+            :func:`unghost.evaluation.scoring.comparison.compare_methods` adds is shown where it is there.
+        pictures: of :func:`unghost.evaluation.report.pictures.view_pictures`, in order.
 
     Raises:
         ValueError: results without rows.

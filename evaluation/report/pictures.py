@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .checks import Mask
-from .page_tables import METRICS, number, text
-from .renders_folder import Method
-from .views import Truth
+from ..metrics.checks import Mask
+from ..scoring.renders import Method
+from ..scoring.views import Truth
+from .tables import METRICS, number, text
 
 LARGEST_SIDE = 1200  # pixels; larger pictures are shrunk for the page
 COARSE = 320  # pixels across; smaller ones are shown with their pixels as squares
@@ -78,7 +78,7 @@ def view_pictures(
         names: of the views, in order.
         methods, truth: what was rendered and photographed.
         masks: method -> ``(n, H, W)`` bool, the pixels that counted; the error of others is drawn grey.
-        rows: of :func:`unghost.evaluation.comparison.compare_methods`, for the numbers.
+        rows: of :func:`unghost.evaluation.scoring.comparison.compare_methods`, for the numbers.
         keys: metrics named in the captions.
     """
     position = {name: index for index, name in enumerate(truth.names)}

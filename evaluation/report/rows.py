@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .conventions import get_convention, one_convention
-from .protocol import json_ready
+from ..scoring.conventions import get_convention, one_convention
+from ..scoring.protocol import json_ready
 
 TABLE_KEYS = (
     "psnr",
@@ -73,7 +73,7 @@ def convention_rows(scores: Mapping[str, Mapping[str, Any]]) -> list[dict[str, A
 
     Args:
         scores: convention -> its scores of one and the same renders (:meth:`SceneScores.means` or a row of
-            :func:`unghost.evaluation.scoring.summarize`).
+            :func:`unghost.evaluation.scoring.engine.summarize`).
 
     Returns:
         Rows ``{"metric", <convention>: value or None, …, "spread"}``, ``spread`` being the largest finite value less

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from .conventions import one_convention
+from ..scoring.conventions import one_convention
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .checks import Mask
+from ..metrics.checks import Mask
+from ..metrics.perceptual import Lpips
+from ..report.rows import convention_rows
 from .conventions import (
     CONVENTIONS,
     DEFAULT_CONVENTION,
@@ -19,12 +21,10 @@ from .conventions import (
     missing_maps,
 )
 from .curves import Curve, against_points, compare, cut_to_coverage
+from .engine import SceneScores, score_scene, score_under_all, summarize
 from .intervals import RESAMPLES, bootstrap_difference
-from .perceptual import Lpips
 from .protocol import common_mask, json_ready
-from .renders_folder import Method
-from .report import convention_rows
-from .scoring import SceneScores, score_scene, score_under_all, summarize
+from .renders import Method
 from .views import Truth
 
 KNOB_STEPS = 10  # coverages at which a method with a knob is scored: its own, and nine evenly below it
@@ -93,27 +93,27 @@ def compare_methods(
     Args:
         methods: of different names.
         truth: of the views.
-        extent: as :func:`unghost.evaluation.scoring.score_scene` takes it.
+        extent: as :func:`unghost.evaluation.scoring.engine.score_scene` takes it.
         rng: of the bootstrap.
         convention: of all rows.
         references: methods that the others are compared with, image by image.
-        network, keys: as :func:`unghost.evaluation.scoring.score_scene` takes them.
+        network, keys: as :func:`unghost.evaluation.scoring.engine.score_scene` takes them.
         resamples: of the bootstrap.
         side_by_side: score under every other convention, too.
 
     Returns:
-        ``rows``: a method each: :func:`unghost.evaluation.scoring.summarize`, and ``per_image``, ``notes``,
+        ``rows``: a method each: :func:`unghost.evaluation.scoring.engine.summarize`, and ``per_image``, ``notes``,
         ``infinite`` (metrics whose mean is infinite, stored as null: a render equals its photo), ``psnr_common`` and
         ``coverage_common`` (on the pixels that count for *every* method), ``curve`` (of a method with a knob) and
         ``point`` (of any), in whose PSNR every pixel counts alike, whichever view it is in,
-        ``at_coverage``, ``psnr_at_coverage`` and ``psnr_area`` of :func:`unghost.evaluation.curves.compare`.
+        ``at_coverage``, ``psnr_at_coverage`` and ``psnr_area`` of :func:`unghost.evaluation.scoring.curves.compare`.
         ``differences``: method less reference over the same images, with intervals. ``against_points``: curves
         against points at the points' own coverages. ``conventions``: method -> rows of
-        :func:`unghost.evaluation.report.convention_rows`.
+        :func:`unghost.evaluation.report.rows.convention_rows`.
 
     Raises:
         ValueError: two methods of one name, an unknown reference, and what
-            :func:`unghost.evaluation.scoring.score_scene` refuses.
+            :func:`unghost.evaluation.scoring.engine.score_scene` refuses.
     """
     names = [each.name for each in methods]
     if not names or len(set(names)) != len(names):

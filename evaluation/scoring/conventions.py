@@ -1,7 +1,8 @@
 """Every published way to score the two-trajectory protocol, by name.
 
-Scores of two of them differ by decibels on the very same renders (:func:`unghost.evaluation.report.format_conventions`
-prints by how much), so that a row carries its convention and nothing puts two of them into one column.
+Scores of two of them differ by decibels on the very same renders
+(:func:`unghost.evaluation.report.rows.format_conventions` prints by how much), so that a row carries its convention
+and nothing puts two of them into one column.
 """
 
 from __future__ import annotations
@@ -13,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from ..core.cameras import Cameras
-from .checks import Mask, choose
-from .mask_scores import predicted_mask
+from ...core.cameras import Cameras
+from ..metrics.checks import Mask, choose
+from ..metrics.masks import predicted_mask
 from .protocol import depth_limit
 from .views import Renders, Truth
 

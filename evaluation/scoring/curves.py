@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .checks import Mask
+from ..metrics.checks import Mask
 from .conventions import one_convention
 
 FloatArray = NDArray[np.float64]

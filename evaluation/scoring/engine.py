@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from . import metrics
-from .checks import Mask
+from ..metrics import pixelwise as metrics
+from ..metrics.checks import Mask
+from ..metrics.perceptual import Lpips, lpips
 from .conventions import (
     AGREEMENT_KEYS,
     CONVENTIONS,
@@ -24,7 +25,6 @@ from .conventions import (
     missing_maps,
 )
 from .intervals import bootstrap_scenes, defined
-from .perceptual import Lpips, lpips
 from .views import Renders, Truth, check_match, view_normals
 
 DATA_RANGE = 1.0
@@ -105,8 +105,8 @@ def score_scene(
             depth limit.
         convention: a name that :func:`get_convention` knows.
         within: ``(n, H, W)`` bool, only these of the convention's pixels count, and are claimed: those of
-            :func:`unghost.evaluation.curves.cut_to_coverage`, or that all compared methods have.
-        network: of :func:`unghost.evaluation.perceptual.load_lpips`; without it LPIPS is None and noted.
+            :func:`unghost.evaluation.scoring.curves.cut_to_coverage`, or that all compared methods have.
+        network: of :func:`unghost.evaluation.metrics.perceptual.load_lpips`; without it LPIPS is None and noted.
         keys: metrics to compute, of those the convention defines; None: all that the maps allow, the others None and
             noted. A metric that is *asked for* without its maps is an error.
         pixels_per_degree: of FLIP.

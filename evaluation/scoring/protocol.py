@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.cameras import Cameras
-from . import metrics
+from ...core.cameras import Cameras
+from ..metrics import pixelwise as metrics
 
 Mask = NDArray[np.bool_]
 
@@ -147,7 +147,7 @@ def score(
         visible: ``(n, H, W)`` bool of :func:`visibility_masks`.
         limit: of :func:`depth_limit`.
         common: ``(n, H, W)`` of :func:`common_mask`; adds ``psnr_common`` and ``coverage_common``.
-        ssim_convention: see :func:`unghost.evaluation.metrics.ssim`.
+        ssim_convention: see :func:`unghost.evaluation.metrics.pixelwise.ssim`.
 
     Returns:
         ``psnr ssim depth_mse disparity_mae normal_mean_deg normal_median_deg normal_pct_30 coverage`` (of

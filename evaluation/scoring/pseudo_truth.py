@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.cameras import Cameras
-from .checks import Mask
+from ...core.cameras import Cameras
+from ..metrics.checks import Mask
+from ..metrics.geometry import normals_from_depth
 from .conventions import SceneExtent
-from .geometry import normals_from_depth
 from .protocol import view_counts
 from .views import Truth, check_depth, check_normals
 

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .checks import Mask
+from ..metrics.checks import Mask
 from .views import Renders
 
 PICTURES = (".png", ".jpg", ".jpeg")

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.cameras import Cameras
-from .checks import Mask
-from .geometry import normals_from_depth
+from ...core.cameras import Cameras
+from ..metrics.checks import Mask
+from ..metrics.geometry import normals_from_depth
 
 COLOUR_SLACK = 1e-4  # renderers overshoot [0, 1] by rounding; more is refused, never clipped in silence
 

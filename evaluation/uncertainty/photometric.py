@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.cameras import Cameras
+from ...core.cameras import Cameras
 
 FloatArray = NDArray[np.float64]
 CHUNK = 1 << 14  # points at a time: what fits a processor's cache

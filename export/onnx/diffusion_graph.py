@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.schedule import alphas_cumprod, flip_log_odds
+from ...core.schedule import alphas_cumprod, flip_log_odds
 from .graph import GraphBuilder
 
 if TYPE_CHECKING:
-    from ..prior.diffusion_network import DiffusionConfig
-    from ..prior.networks import AnyNetwork
+    from ...prior.diffusion.model import DiffusionConfig
+    from ...prior.networks.registry import AnyNetwork
 
 Tail = Callable[[GraphBuilder, str], None]
 
@@ -23,11 +23,11 @@ TOLERANCE, UNET_TOLERANCE = 1e-4, 2e-3  # of x0_pred, ONNX against torch
 def denoiser_model(network: AnyNetwork) -> Any:
     """A network as an ONNX ``ModelProto`` without metadata; inputs and output as in :func:`.planar.planar_model`.
 
-    Of compact networks, diffusions among them, only operators from :data:`unghost.export.graph.OPERATORS` are used; the
-    U-Net needs a few more, :data:`unghost.export.unet_graph.UNET_OPERATORS`.
+    Of compact networks, diffusions among them, only operators from :data:`unghost.export.onnx.graph.OPERATORS` are
+    used; the U-Net needs a few more, :data:`unghost.export.onnx.unet_graph.UNET_OPERATORS`.
     """
-    from ..prior.diffusion_network import DiffusionNet
-    from ..prior.unet import UNet
+    from ...prior.diffusion.model import DiffusionNet
+    from ...prior.networks.unet import UNet
     from .planar import planar_model
     from .unet_graph import unet_model
 
@@ -44,7 +44,7 @@ def export_tolerance(network: AnyNetwork) -> float:
     A group norm divides what hardly varies, as an empty cube's features, by as little as ``sqrt(1e-5)``: the U-Net
     magnifies the rounding of the convolutions before it up to 316 times (4e-4 was seen, 1e-5 on cubes with content).
     """
-    from ..prior.unet import UNet
+    from ...prior.networks.unet import UNet
 
     return UNET_TOLERANCE if any(isinstance(part, UNet) for part in network.modules()) else TOLERANCE
 
@@ -84,5 +84,5 @@ _TAILS: dict[str, Tail] = {"epsilon": _from_epsilon, "x0": _clamped, "bernoulli"
 
 
 def x0_tail(config: DiffusionConfig) -> Tail:
-    """What turns the last layer of a diffusion into ``x0_pred``; see ``prior/diffusion_network.py``."""
+    """What turns the last layer of a diffusion into ``x0_pred``; see ``prior/diffusion/model.py``."""
     return _from_shortcut if config.shortcut else _TAILS[config.objective]

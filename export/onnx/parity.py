@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.channels import (
+from ...core.channels import (
     OPTIONAL_CHANNELS,
     SIGNED_OPACITY,
     VIEW_COUNT,
@@ -20,11 +20,11 @@ from ..core.channels import (
     encode_view_count,
     stack_channels,
 )
-from ..core.frames import RESOLUTION, unit_lattice
-from ..core.manifest import Denoiser, Manifest
-from ..core.occupancy import EMPTY, OCCUPIED, occupancy_from_signed, signed_from_opacity
-from ..core.schedule import TIMESTEPS
-from .container import precision_of
+from ...core.frames import RESOLUTION, unit_lattice
+from ...core.manifest import Denoiser, Manifest
+from ...core.occupancy import EMPTY, OCCUPIED, occupancy_from_signed, signed_from_opacity
+from ...core.schedule import TIMESTEPS
+from ..container import precision_of
 
 ERROR_TOLERANCE, FLIP_TOLERANCE = 1e-4, 1e-5
 
@@ -198,10 +198,10 @@ def verify(
         ValueError: either file is unreadable, or they take different channels.
     """
     try:
-        from ..prior.checkpoint import load_model
+        from ...prior.checkpoint import load_model
     except ImportError as error:
         raise ImportError(f"verify: needs {error.name}: pip install unghost[export]") from None
-    from .runtime import OnnxDenoiser
+    from ..runtime import OnnxDenoiser
 
     exported = OnnxDenoiser(onnx_path, threads=threads, providers=["CPUExecutionProvider"])
     reference = load_model(checkpoint_path)

@@ -24,20 +24,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.frames import RESOLUTION
-from ..core.schedule import TIMESTEPS
+from ...core.frames import RESOLUTION
+from ...core.schedule import TIMESTEPS
 from .graph import GraphBuilder
-from .planar_context import planar_context
+from .surroundings_branch import planar_context
 
 if TYPE_CHECKING:
-    from ..prior.network import RestorationNet
+    from ...prior.networks.restoration import RestorationNet
 
 Weights = NDArray[np.float32]
 PAIRS = RESOLUTION // 4  # pairs of 16^3 slices, and slices at 8^3
 
 
 def _activate(graph: GraphBuilder, value: str) -> str:
-    from ..prior.context import LEAK
+    from ...prior.networks.context import LEAK
 
     return graph.node("LeakyRelu", value, alpha=LEAK)
 
@@ -87,9 +87,9 @@ def _up(graph: GraphBuilder, value: str, weight: Weights, bias: Weights) -> str:
 
 def _condition(graph: GraphBuilder, weights: dict[str, Weights], pooled: str | None) -> str:
     """All biases of all blocks, ``(N, sum of widths)``; ``pooled`` is the summary of the surroundings, if any."""
-    from ..prior.network import EDGE_FRACTION_CENTER as center
-    from ..prior.network import EDGE_FRACTION_SPREAD as spread
-    from ..prior.network import FREQUENCIES as frequencies
+    from ...prior.networks.restoration import EDGE_FRACTION_CENTER as center
+    from ...prior.networks.restoration import EDGE_FRACTION_SPREAD as spread
+    from ...prior.networks.restoration import FREQUENCIES as frequencies
 
     time = graph.node("Div", graph.node("Cast", "timestep", to=1), graph.constant(TIMESTEPS - 1.0))
     log = graph.node("Log", graph.node("Div", "edge_fraction", graph.constant(center)))

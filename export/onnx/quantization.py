@@ -22,11 +22,11 @@ from typing import Any
 
 import numpy as np
 
-from ..core.manifest import Manifest
-from ..core.schedule import TIMESTEPS
-from .container import PRECISIONS, body_of, precision_of, unseal, write_sealed
+from ...core.manifest import Manifest
+from ...core.schedule import TIMESTEPS
+from ..container import PRECISIONS, body_of, precision_of, unseal, write_sealed
+from ..runtime import read_file, read_manifest
 from .parity import ParityInputs, check_inputs, compare, parity_inputs, session_denoiser
-from .runtime import read_file, read_manifest
 
 QUANTISED = ("Conv", "Add", "LeakyRelu", "Relu", "Pad", "Gather", "Reshape")  # operators that int8 may run through
 MOVING = ("Pad", "Gather", "Reshape")  # of these, the ones that only move values

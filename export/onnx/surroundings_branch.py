@@ -1,4 +1,4 @@
-"""The branch for the surroundings (``prior/context.py``) as 2D convolutions over depth slices; see ``planar.py``."""
+"""The surroundings branch (``prior/networks/context.py``) as 2D convolutions over depth slices; see ``planar.py``."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.channels import LEAST_KNOWN, REPEAT, UNKNOWN
-from ..core.frames import RESOLUTION
-from ..core.shards import SURROUNDINGS_RESOLUTION
+from ...core.channels import LEAST_KNOWN, REPEAT, UNKNOWN
+from ...core.frames import RESOLUTION
+from ...core.shards.storage import SURROUNDINGS_RESOLUTION
 from .graph import GraphBuilder
 
 Weights = NDArray[np.float32]
@@ -61,7 +61,7 @@ def planar_context(
     Returns:
         names of what is added at 8^3 ``(N * 8, middle, 8, 8)``, and of the summary ``(N, width)``.
     """
-    from ..prior.context import interpolation
+    from ...prior.networks.context import interpolation
 
     enter, mix, down = (weights[f"context.{name}.weight"] for name in ("enter", "mix", "down"))
     enter_bias, mix_bias, down_bias = (weights[f"context.{name}.bias"] for name in ("enter", "mix", "down"))

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..core.manifest import Manifest
-from .container import write_sealed
+from ...core.manifest import Manifest
+from ..container import write_sealed
 
 
 def export_onnx(checkpoint_path: str | Path, out_path: str | Path, *, verify_cubes: int = 8) -> Manifest:
@@ -13,8 +13,8 @@ def export_onnx(checkpoint_path: str | Path, out_path: str | Path, *, verify_cub
 
     Inputs ``channels (N, C, 32, 32, 32) float32`` in [-1, 1], ``timestep (N,) int64``, ``edge_fraction (N,)
     float32``; output ``x0_pred (N, 1, 32, 32, 32) float32``. The graph is the planar twin of the network
-    (``export/planar.py``; of the paper's U-Net a plain one, ``export/unet_graph.py``). It is compared with torch
-    before a file appears under ``out_path``.
+    (``export/onnx/planar.py``; of the paper's U-Net a plain one, ``export/onnx/unet_graph.py``). It is compared with
+    torch before a file appears under ``out_path``.
 
     Args:
         checkpoint_path: of ``unghost.prior.checkpoint.save_model``.
@@ -31,7 +31,7 @@ def export_onnx(checkpoint_path: str | Path, out_path: str | Path, *, verify_cub
     try:
         import onnx
 
-        from ..prior.checkpoint import load_model
+        from ...prior.checkpoint import load_model
         from .diffusion_graph import denoiser_model, export_tolerance
     except ImportError as error:
         raise ImportError(f"export_onnx: needs {error.name}: pip install unghost[export]") from None
@@ -48,6 +48,6 @@ def export_onnx(checkpoint_path: str | Path, out_path: str | Path, *, verify_cub
         if not report["max_error"] <= allowed:
             raise ValueError(f"export_onnx: ONNX and torch differ by {report['max_error']:.2e}, more than {allowed:g}")
     write_sealed(out_path, body, denoiser.manifest)
-    from .runtime import read_manifest
+    from ..runtime import read_manifest
 
     return read_manifest(out_path)

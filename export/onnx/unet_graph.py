@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.frames import RESOLUTION
+from ...core.frames import RESOLUTION
 from .graph import OPERATORS, GraphBuilder
 
 if TYPE_CHECKING:
-    from ..prior.unet import UNet, UNetConfig
+    from ...prior.networks.unet import UNet, UNetConfig
 
 UNET_OPERATORS = OPERATORS | {"MatMul", "ReduceMean", "Sigmoid", "Softmax"}
 
@@ -99,8 +99,8 @@ class _UNetGraph(GraphBuilder):
 
 
 def _embedding(graph: _UNetGraph, network: UNet) -> str:
-    """The activated embedding of timestep and edge fraction, ``(N, E)``; features as in ``prior/unet.py``."""
-    from ..prior import unet
+    """The activated embedding of timestep and edge fraction, ``(N, E)``; features as in ``prior/networks/unet.py``."""
+    from ...prior.networks import unet
 
     half, axis = network.config.base_width // 2, graph.constant([1], np.int64)
     time = graph.node("Unsqueeze", graph.node("Cast", "timestep", to=1), axis)
@@ -126,7 +126,7 @@ def unet_model(network: UNet, *, tail: Callable[[GraphBuilder, str], None] | Non
         network: of any configuration.
         tail: makes the node ``x0_pred`` from the last layer; None for ``tanh(raw / 2)``, a restoration network's.
 
-    Inputs and output are those of :func:`unghost.export.planar.planar_model`, of one channel.
+    Inputs and output are those of :func:`unghost.export.onnx.planar.planar_model`, of one channel.
     """
     import onnx
     from onnx.helper import make_tensor_value_info

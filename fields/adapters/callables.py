@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core.aabb import as_aabb
-from ..core.arrays import Array, is_tensor, namespace, to_numpy
-from ..core.occupancy import check_density_shape
+from ...core.aabb import as_aabb
+from ...core.arrays import Array, is_tensor, namespace, to_numpy
+from ...core.occupancy import check_density_shape
 
 DensityFn = Callable[[Array], Array]
 

@@ -11,29 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .core.aabb import as_aabb
+from ...core.aabb import as_aabb
+from ...core.lattice import cell_centers as cell_centers
+from ...core.lattice import cell_pitch as cell_pitch
 
 DensityFn = Callable[[NDArray[Any]], NDArray[np.float32]]
-
-
-def cell_centers(aabb: ArrayLike, shape: tuple[int, int, int]) -> NDArray[np.float32]:
-    """Centres of the cells of a grid that fills ``aabb``, ``(*shape, 3)`` float32, index order ``[x, y, z]``."""
-    box = as_aabb(aabb, caller="cell_centers")
-    axes = [low + (np.arange(n) + 0.5) * (high - low) / n for low, high, n in zip(box[0], box[1], shape)]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).astype(np.float32)
-
-
-def cell_pitch(aabb: ArrayLike, shape: tuple[int, ...], *, caller: str = "cell_pitch") -> float:
-    """Side of the cells, scene units.
-
-    Raises:
-        ValueError: the cells are not cubes (sides differ by more than 1 %).
-    """
-    box = as_aabb(aabb, caller=caller)
-    sides = (box[1] - box[0]) / np.array(shape, dtype=float)
-    if sides.max() > 1.01 * sides.min():
-        raise ValueError(f"{caller}: aabb and grid must make cubic cells (to 1 %), got sides {sides.round(6).tolist()}")
-    return float(sides.mean())
 
 
 def grid_density_fn(density: NDArray[Any], aabb: ArrayLike) -> DensityFn:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from ..core.arrays import Array, namespace
+from ...core.arrays import Array, namespace
 
 DensityFn = Callable[[Array], Array]
 

@@ -17,8 +17,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..core.occupancy import EMPTY, OCCUPIED, SURFACE_LABEL, signed_from_occupancy
-from ..core.schedule import alphas_cumprod
+from ...core.occupancy import EMPTY, OCCUPIED, SURFACE_LABEL, signed_from_occupancy
+from ...core.schedule import alphas_cumprod
 
 _KEPT: NDArray[np.float64] = np.append(alphas_cumprod(), 1.0)  # index -1 is "no noise"
 

@@ -27,11 +27,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ..core.occupancy import EMPTY, OCCUPIED
-from ..core.schedule import flip_log_odds
-from .diffusion import kept_share, q_flip, q_sample, x0_from_epsilon
-from .network import NetworkConfig, RestorationNet
-from .unet import UNet, UNetConfig
+from ...core.occupancy import EMPTY, OCCUPIED
+from ...core.schedule import flip_log_odds
+from ..networks.restoration import NetworkConfig, RestorationNet
+from ..networks.unet import UNet, UNetConfig
+from .formulas import kept_share, q_flip, q_sample, x0_from_epsilon
 
 KIND = "diffusion"
 OBJECTIVES = ("epsilon", "x0", "bernoulli")

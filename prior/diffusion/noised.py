@@ -13,8 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .checkpoint import TorchDenoiser
-from .diffusion_network import DiffusionNet
+from ..checkpoint import TorchDenoiser
+from .model import DiffusionNet
 
 
 class NoisedDenoiser:

@@ -7,10 +7,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..core.frames import RESOLUTION
-from ..core.schedule import TIMESTEPS
-from .diffusion import clean_cubes
-from .diffusion_network import DiffusionNet
+from ...core.frames import RESOLUTION
+from ...core.schedule import TIMESTEPS
+from .formulas import clean_cubes
+from .model import DiffusionNet
 
 DRAWS_STREAM = 1  # apart from the stream that chooses the cubes
 
@@ -39,7 +39,7 @@ def diffusion_losses(
 
     Args:
         network: to train.
-        labels: ``(N, 32, 32, 32)`` uint8; see :func:`unghost.prior.diffusion.clean_cubes`.
+        labels: ``(N, 32, 32, 32)`` uint8; see :func:`unghost.prior.diffusion.formulas.clean_cubes`.
         edge_fraction: ``(N,)`` > 0.
         index: ``(N,)`` numbers of the samples.
         seed: of the run.

@@ -13,11 +13,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..core.frames import RESOLUTION
-from ..core.occupancy import signed_from_occupancy
-from ..core.schedule import TIMESTEPS, strided_timesteps
-from .diffusion import bernoulli_posterior, epsilon_from_x0, kept_share
-from .diffusion_network import DiffusionNet
+from ...core.frames import RESOLUTION
+from ...core.occupancy import signed_from_occupancy
+from ...core.schedule import TIMESTEPS, strided_timesteps
+from .formulas import bernoulli_posterior, epsilon_from_x0, kept_share
+from .model import DiffusionNet
 
 Denoise = Callable[[Tensor, Tensor, Tensor], Tensor]
 

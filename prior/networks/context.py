@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ..core.channels import LEAST_KNOWN, REPEAT, UNKNOWN, coincident_weights
+from ...core.channels import LEAST_KNOWN, REPEAT, UNKNOWN, coincident_weights
 
 LEAK = 0.1  # slope of the rectifiers below zero
 GRID = 8  # voxels along the branch's grid (three edges) and along the cube's middle one (one edge)

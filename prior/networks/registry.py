@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, TypeAlias
 
-from .diffusion_network import KIND as DIFFUSION
-from .diffusion_network import DiffusionConfig, DiffusionNet
-from .network import NetworkConfig, RestorationNet, gflop
+from ..diffusion.model import KIND as DIFFUSION
+from ..diffusion.model import DiffusionConfig, DiffusionNet
+from .restoration import NetworkConfig, RestorationNet, gflop
 from .unet import KIND as UNET
 from .unet import UNet, UNetConfig, unet_gflop
 

@@ -6,7 +6,7 @@ No normalisation layers, all work on grids of 16^3 and coarser, where 3D convolu
                 \\______________________________ gain * first channel _____________________________/
 
 The surroundings, where a network has them, do not line up with the cube and enter by a branch of their own
-(``prior/context.py``) at 8^3.
+(``prior/networks/context.py``) at 8^3.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ..core.channels import SIGNED_OPACITY, SURROUNDINGS, check_channels
-from ..core.frames import RESOLUTION
-from ..core.occupancy import opacity_from_signed
-from ..core.schedule import TIMESTEPS
+from ...core.channels import SIGNED_OPACITY, SURROUNDINGS, check_channels
+from ...core.frames import RESOLUTION
+from ...core.occupancy import opacity_from_signed
+from ...core.schedule import TIMESTEPS
 from .context import LEAK as LEAK
 from .context import ContextBranch, activate, context_work
 

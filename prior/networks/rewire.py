@@ -7,8 +7,8 @@ import dataclasses
 import torch
 from torch import Tensor, nn
 
-from ..core.channels import SURROUNDINGS, UNKNOWN
-from .network import RestorationNet
+from ...core.channels import SURROUNDINGS, UNKNOWN
+from .restoration import RestorationNet
 
 BLOCK = 8  # input features of the stem per aligned channel: space-to-depth
 

@@ -24,8 +24,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ..core.frames import RESOLUTION
-from .network import NetworkConfig
+from ...core.frames import RESOLUTION
+from .restoration import NetworkConfig
 
 KIND = "unet"
 EDGE_FRACTION_LEAST, EDGE_FRACTION_MOST = 0.005, 1.0  # the embedding varies between them, evenly in the logarithm
@@ -71,7 +71,8 @@ class UNetConfig:
 
     @property
     def channels(self) -> Any:
-        """Input channels, as :class:`unghost.prior.network.NetworkConfig` says it: signed opacity alone."""
+        """Input channels, as :class:`unghost.prior.networks.restoration.NetworkConfig` says it: signed opacity
+        alone."""
         return NetworkConfig().channels
 
     @property

@@ -2,7 +2,7 @@
 
 glibc returns blocks of 32 MiB and more (and the top of the heap) to the system when they are freed; getting them back
 costs a page fault for every 4 KiB. What that makes of a training
-step: ``benchmarks/training_speed.py``.
+step: ``benchmarks/release/training_speed.py``.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.channels import (
+from ...core.channels import (
     OPTIONAL_CHANNELS,
     SIGNED_OPACITY,
     SURROUNDINGS,
@@ -28,9 +28,9 @@ from ..core.channels import (
     encode_known,
     stack_channels,
 )
-from ..core.packing import dequantize_share, dequantize_signed, unpack_labels
-from ..core.schedule import timestep_from_severity
-from ..core.shards import Shard, read_shard
+from ...core.schedule import timestep_from_severity
+from ...core.shards.packing import dequantize_share, dequantize_signed, unpack_labels
+from ...core.shards.storage import Shard, read_shard
 
 SYMMETRIES: tuple[tuple[tuple[int, ...], tuple[int, ...]], ...] = tuple(
     (permutation, tuple(axis for axis in range(3) if flips >> axis & 1))

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.channels import stack_channels
+from ...core.channels import stack_channels
 from .batches import Batch, Mixture, any_edge, timesteps
 
 STREAM = 0x6F6E6C  # keeps the timesteps of online samples apart from the draws of the mixture

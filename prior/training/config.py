@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from .network import NetworkConfig
-from .networks import BackboneConfig, backbone_from_dict, network_for
+from ..networks.registry import BackboneConfig, backbone_from_dict, network_for
+from ..networks.restoration import NetworkConfig
 
 
 @dataclass(frozen=True)

@@ -12,18 +12,18 @@ from typing import Any
 
 import torch
 
-from ..core.manifest import Manifest
-from ..core.results import commit, versions
-from ..core.shards import Shard, read_shard
+from ...core.manifest import Manifest
+from ...core.results import commit, versions
+from ...core.shards.storage import Shard, read_shard
+from ..checkpoint import TorchDenoiser, save_model
+from ..networks.registry import DEFAULT_TIMESTEPS, family, network_gflop
+from ..networks.restoration import parameter_count
 from .batches import Mixture
 from .blend import Blend, Online
-from .checkpoint import TorchDenoiser, save_model
 from .config import TrainConfig
 from .distributed import Group, joined
-from .evaluate import evaluate
-from .network import parameter_count
-from .networks import DEFAULT_TIMESTEPS, family, network_gflop
-from .trainer import Trainer, TrainingDiverged
+from .run_state import Trainer, TrainingDiverged
+from .validation import evaluate
 from .watch import WATCH_STEPS, LossWatch, complaint
 
 MODEL_FILE, STATE_FILE, CONFIG_FILE, LOG_FILE = "model.safetensors", "state.safetensors", "config.json", "log.jsonl"
@@ -276,7 +276,8 @@ def train(
 
     Args:
         config: the run.
-        train_shards: folders of :func:`unghost.core.shards.write_shard` and their weights in the mixture; may be empty
+        train_shards: folders of :func:`unghost.core.shards.storage.write_shard` and their weights in the mixture; may
+        be empty
             where online sources fill the batches.
         validation_shards: name to folder; held out.
         online: sources of pairs that are made meanwhile, each with its share of every batch. A run that is resumed with

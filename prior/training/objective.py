@@ -6,12 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ..core.occupancy import (
-    DEFAULT_OPACITY_THRESHOLD,
-    IGNORE_LABEL,
-    SURFACE_LABEL,
-    opacity_from_signed,
-)
+from ...core.occupancy import DEFAULT_OPACITY_THRESHOLD, IGNORE_LABEL, SURFACE_LABEL, opacity_from_signed
 
 
 def interesting_voxels(signed_opacity: Tensor, labels: Tensor) -> Tensor:

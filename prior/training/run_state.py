@@ -11,16 +11,16 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ..checkpoint import CONFIG_KEY, load_model, read_tensors, write_tensors
+from ..diffusion.model import DiffusionNet
+from ..diffusion.objective import diffusion_losses
+from ..networks.registry import AnyNetwork, build_network, network_for
+from ..networks.rewire import can_rewire, rewire
 from .batches import Batch
-from .checkpoint import CONFIG_KEY, load_model, read_tensors, write_tensors
 from .config import TrainConfig
-from .diffusion_network import DiffusionNet
-from .diffusion_training import diffusion_losses
 from .distributed import Group
 from .ema import ExponentialMovingAverage
-from .networks import AnyNetwork, build_network, network_for
 from .objective import restoration_loss
-from .rewire import can_rewire, rewire
 
 
 class TrainingDiverged(RuntimeError):

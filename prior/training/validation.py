@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..core.arrays import to_numpy
-from ..core.manifest import Denoiser
-from ..core.occupancy import (
+from ...core.arrays import to_numpy
+from ...core.manifest import Denoiser
+from ...core.occupancy import (
     DECISION,
     DEFAULT_OPACITY_THRESHOLD,
     FREE_LABEL,
@@ -21,8 +21,8 @@ from ..core.occupancy import (
     SURFACE_LABEL,
     opacity_from_signed,
 )
-from ..core.packing import unpack_labels
-from ..core.shards import Shard
+from ...core.shards.packing import unpack_labels
+from ...core.shards.storage import Shard
 from .batches import stored_channels
 
 HISTOGRAM_BINS = 2048  # over [-1, 1]: thresholds are exact to 1/1024

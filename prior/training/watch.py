@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ..core.frames import unit_lattice
+from ...core.frames import unit_lattice
 
 WATCH_STEPS = 100  # between looks at the network, beside one before each checkpoint
 DEAD = 1e-5  # float32 rounding gives about 1e-7

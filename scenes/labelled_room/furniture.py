@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .core import signed_distance as sd
+from ...core.distances import signed as sd
 
 Floats = NDArray[np.float32]
 WALL = 2.4  # metres from the middle of the room to the face of each wall

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .core import signed_distance as sd
-from .core.frames import random_rotations
+from ...core.distances import signed as sd
+from ...core.frames import random_rotations
 
 Floats = NDArray[np.float32]
 KINDS = ("detached", "touching", "fog", "faint", "streak")

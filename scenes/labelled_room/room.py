@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .core.occupancy import OccupancyRule
-from .demo_furniture import Floats, Solid, solids
-from .demo_ghosts import add_ghosts, sigmoid, smooth_noise
-from .grids import cell_centers, cell_pitch
+from ...core.lattice import cell_centers, cell_pitch
+from ...core.occupancy import OccupancyRule
+from .furniture import Floats, Solid, solids
+from .ghosts import add_ghosts, sigmoid, smooth_noise
 
 AABB = np.array([[-2.56, -2.56, -0.16], [2.56, 2.56, 2.40]])
 SHAPE = (128, 128, 64)

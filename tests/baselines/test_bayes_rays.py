@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 import torch
 
+from unghost.baselines.bayes_rays import color_slopes, deformation_uncertainty
 from unghost.fields.filtered import FilteredField
 from unghost.fields.kinds import make_field
 from unghost.fields.rendering import Sampling, render_rays, render_view
 from unghost.fields.training import TrainingConfig, train_field
-from unghost.fields.uncertainty import color_slopes, deformation_uncertainty
 
 SAMPLING = Sampling(near=0.05, middle=2.4, near_samples=48, far_samples=0)
 
@@ -69,7 +69,7 @@ def test_the_hessian_is_the_change_of_colour_when_a_node_is_moved(trained):
         def query(self, positions):
             return field.query(self._bend(positions))
 
-    from unghost.fields.uncertainty import _add, _sensitivity
+    from unghost.baselines.bayes_rays import _add, _sensitivity
 
     sampling = Sampling(near=0.05, middle=1.0, near_samples=60, far_samples=0, minimal_weight=0.0)
     with torch.no_grad():

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from unghost.core.distortion import distortion
-from unghost.core.schedule import alphas_cumprod
-from unghost.regularizer.rivals import (
+from unghost.baselines.losses import (
     depth_smoothness_loss,
     distortion_loss,
     free_space_loss,
@@ -18,6 +16,8 @@ from unghost.regularizer.rivals import (
     squash_density,
     total_variation_loss,
 )
+from unghost.core.ray_distortion import distortion
+from unghost.core.schedule import alphas_cumprod
 
 RNG = torch.Generator().manual_seed(0)
 

@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
 
-from unghost.regularizer.components import dilate, label_components
+from unghost.cleaning.components import dilate, label_components
 
 
 @settings(max_examples=40, deadline=None)

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 
+from unghost.cleaning.pipeline import clean
 from unghost.core.channels import CHANNEL_NAMES
 from unghost.core.manifest import Manifest
 from unghost.denoisers import load_denoiser, shipped_names
-from unghost.regularizer.clean import clean
-from unghost.regularizer.regularizer import DensityRegularizer
+from unghost.regularizer.density_regularizer import DensityRegularizer
 
 NAMES = [
     "analytic-numpy",
@@ -25,9 +25,9 @@ NAMES = [
 @pytest.fixture(scope="module")
 def all_channels(tmp_path_factory):
     """A small network of all channels with fresh weights, by both engines."""
-    from unghost.export.to_onnx import export_onnx
+    from unghost.export.onnx.to_onnx import export_onnx
     from unghost.prior.checkpoint import save_model
-    from unghost.prior.network import NetworkConfig, RestorationNet
+    from unghost.prior.networks.restoration import NetworkConfig, RestorationNet
 
     folder = tmp_path_factory.mktemp("all_channels")
     torch.manual_seed(0)

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 import torch
 
+from unghost.cleaning.grid_channels import GridContext, light_maps, viewing_cameras
+from unghost.cleaning.pipeline import clean
 from unghost.core.cameras import Cameras
 from unghost.core.channels import (
     CHANNEL_NAMES,
@@ -13,14 +15,12 @@ from unghost.core.channels import (
     encode_surroundings,
     encode_view_count,
 )
-from unghost.core.cube_views import count_views
 from unghost.core.frames import cube_lattices, random_rotations, unit_lattice
-from unghost.core.transmittance import FAN, STEPS
-from unghost.data_recipes.harvest_context import surroundings
-from unghost.regularizer.clean import clean
-from unghost.regularizer.context import GridContext, light_maps, viewing_cameras
+from unghost.core.visibility.transmittance import FAN, STEPS
+from unghost.core.visibility.view_counts import count_views
+from unghost.data_recipes.harvest.context import surroundings
 from unghost.regularizer.cubes import draw_cubes
-from unghost.regularizer.regularizer import DensityRegularizer
+from unghost.regularizer.density_regularizer import DensityRegularizer
 
 PITCH = 0.05
 SWAPPED = ("signed_opacity", "view_count", "surroundings", "transmittance")

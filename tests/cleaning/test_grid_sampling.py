@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from unghost.cleaning.grid_sampling import survey_field
+from unghost.cleaning.pipeline import clean
+from unghost.cleaning.queries import make_query
 from unghost.core.occupancy import OccupancyRule
-from unghost.grids import cell_centers, grid_density_fn
-from unghost.regularizer.clean import clean
-from unghost.regularizer.queries import make_query
-from unghost.regularizer.survey import survey_field
+from unghost.fields.adapters.grids import cell_centers, grid_density_fn
 
 RULE = OccupancyRule()
 

@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from unghost.regularizer.keep_mask import KeepMask
+from unghost.cleaning.keep_mask import KeepMask
 
 BOX = np.array([[0.0, 0.0, 0.0], [2.0, 1.0, 1.0]])
 

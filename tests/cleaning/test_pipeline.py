@@ -9,9 +9,9 @@ import pytest
 import torch
 from scipy import ndimage
 
+from unghost.cleaning.keep_mask import KeepMask
+from unghost.cleaning.pipeline import CleanSettings, clean, grid_of, threshold_of
 from unghost.core.occupancy import OccupancyRule
-from unghost.regularizer.clean import CleanSettings, clean, grid_of, threshold_of
-from unghost.regularizer.keep_mask import KeepMask
 
 BOX = np.array([[-1.0, -1.0, -0.5], [1.0, 1.0, 0.5]])
 PITCH = 2 / 64
@@ -247,7 +247,7 @@ class Block:
 sys.meta_path.insert(0, Block())
 import numpy as np
 from unghost.core.manifest import Manifest
-from unghost.regularizer.clean import clean
+from unghost.cleaning.pipeline import clean
 class Empty:
     kind, manifest = "numpy", Manifest("empty")
     def __call__(self, channels, timestep, edge_fraction):
@@ -263,7 +263,7 @@ def test_clean_needs_neither_torch_nor_scipy():
 
 
 def test_the_guard_can_fail_and_the_regularizer_names_the_extra():
-    twin = GUARD.replace("TWIN", "import unghost.regularizer.regularizer")
+    twin = GUARD.replace("TWIN", "import unghost.regularizer.density_regularizer")
     failed = subprocess.run([sys.executable, "-c", twin], capture_output=True, text=True, timeout=60, check=False)
     assert failed.returncode != 0
     assert "pip install unghost[torch]" in failed.stderr

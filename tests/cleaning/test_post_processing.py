@@ -1,6 +1,6 @@
 import numpy as np
 
-from unghost.regularizer.decide import decide, removed_regions
+from unghost.cleaning.post_processing import decide, removed_regions
 
 
 def scene():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from unghost.regularizer.queries import field_device, find_backend, make_query
+from unghost.cleaning.queries import field_device, find_backend, make_query
 
 PLACE = np.zeros(3)
 

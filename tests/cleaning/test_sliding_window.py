@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from unghost.regularizer.windows import grow, shrink, vote, window_starts, window_weight
+from unghost.cleaning.sliding_window import grow, shrink, vote, window_starts, window_weight
 
 
 @pytest.mark.parametrize("length", [1, 5, 15, 16, 17, 32, 33, 100, 128])

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from unghost import cli
+from unghost.cleaning.keep_mask import KeepMask
+from unghost.cleaning.splats import box_of, clean_ply, clean_splats, keep_scores, pitch_of
 from unghost.core.manifest import Manifest
-from unghost.fields.splat_ply import Gaussians, read_splat_ply
-from unghost.regularizer.keep_mask import KeepMask
-from unghost.splat_cleaning import box_of, clean_ply, clean_splats, keep_scores, pitch_of
+from unghost.splats.ply import Gaussians, read_splat_ply
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -115,7 +115,7 @@ def test_a_preview_shows_and_changes_nothing(scene, tmp_path, capsys):
 
 
 def test_no_file_is_written_over_another(scene, tmp_path, capsys):
-    from unghost.grids import save_grid
+    from unghost.fields.adapters.grids import save_grid
 
     save_grid(tmp_path / "g.npz", np.ones((4, 4, 4), np.float32), np.array([[0.0, 0, 0], [1, 1, 1]]))
     (tmp_path / "s.ply").write_bytes(scene.read_bytes())
@@ -178,7 +178,7 @@ def test_scores_alone(scene, tmp_path):
 
 
 def test_half_a_million_are_cleaned_within_two_minutes():
-    """The committed result, made by benchmarks/splats.py."""
+    """The committed result, made by benchmarks/cleaning/splats.py."""
     found = json.loads((ROOT / "docs" / "results" / "splats.json").read_text(encoding="utf-8"))
     rows = [row for row in found["rows"] if row["method"] == "unghost"]
     assert len({row["method"] for row in found["rows"]}) == 5

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from unghost.regularizer.clean import clean, judge
-from unghost.regularizer.strength import choose_strength
+from unghost.cleaning.pipeline import clean, judge
+from unghost.cleaning.strength import choose_strength
 
 BOX = np.array([[-1.0] * 3, [1.0] * 3])
 

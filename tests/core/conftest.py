@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from unghost.core.frames import CubeFrame
-from unghost.core.packing import pack_frame, pack_labels
-from unghost.core.shards import write_shard
+from unghost.core.shards.packing import pack_frame, pack_labels
+from unghost.core.shards.storage import write_shard
 
 
 def _arrays(count=2):

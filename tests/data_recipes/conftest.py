@@ -130,7 +130,8 @@ def written(tmp_path, samples):
 def photographed():
     """A ball and a box on a floor, photographed from +x: their -x sides are seen by nobody."""
     pytest.importorskip("torch")
-    from unghost.fields import furniture, scenes, solids
+    from unghost.scenes import furniture, solids
+    from unghost.scenes import generator as scenes
 
     rng = np.random.default_rng(0)
     texture = furniture.random_texture(rng)

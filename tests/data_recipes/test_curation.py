@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from unghost.core.occupancy import FREE_LABEL, IGNORE_LABEL, SURFACE_LABEL
-from unghost.core.packing import dequantize_signed, pack_frame, unpack_frame, unpack_labels
-from unghost.core.shards import ARRAYS, read_shard
-from unghost.data_recipes.compose import sample_cube
-from unghost.data_recipes.curate import curate, damage, sample_pair
+from unghost.core.shards.packing import dequantize_signed, pack_frame, unpack_frame, unpack_labels
+from unghost.core.shards.storage import ARRAYS, read_shard
+from unghost.data_recipes.curation import curate, damage, sample_pair
 from unghost.data_recipes.recipe import Recipe, load_recipe
+from unghost.data_recipes.solids.compose import sample_cube
 
 RECIPE = Recipe(parts=(1, 3))
 
@@ -121,7 +121,7 @@ def test_procedural_cubes_say_where_they_lay_and_are_nobodys(tmp_path):
 
 def test_exact_solids_come_by_tree_and_alone_as_together(tmp_path):
     pytest.importorskip("manifold3d")
-    from unghost.data_recipes import csg
+    from unghost.data_recipes.solids import csg
 
     recipe = dataclasses.replace(load_recipe("csg"), cubes_per_mesh=3, clean_share=1.0, max_dilation=0, solid_share=0.0)
     shard = read_shard(curate(recipe, tmp_path, count=8, seed=0)[0], verify=True)

@@ -12,9 +12,9 @@ import time
 import numpy as np
 import pytest
 
-from unghost.core.shards import read_shard
+from unghost.core.shards.storage import read_shard
 from unghost.data_recipes import pairs
-from unghost.data_recipes.curate import SampleError, curate
+from unghost.data_recipes.curation import SampleError, curate
 from unghost.data_recipes.recipe import Recipe
 
 RECIPE = Recipe(parts=(1, 3))
@@ -22,7 +22,7 @@ RECIPE = Recipe(parts=(1, 3))
 
 KILLED = """
 import sys
-from unghost.data_recipes.curate import curate
+from unghost.data_recipes.curation import curate
 from unghost.data_recipes.recipe import Recipe
 
 if __name__ == "__main__":

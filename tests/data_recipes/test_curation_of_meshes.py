@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from unghost.core.occupancy import SURFACE_LABEL
-from unghost.core.packing import dequantize_signed, unpack_frame, unpack_labels
-from unghost.core.shards import read_shard
-from unghost.data_recipes.curate import SampleError, curate, sample_pair
-from unghost.data_recipes.mesh_files import load_mesh
-from unghost.data_recipes.meshes import Mesh
+from unghost.core.shards.packing import dequantize_signed, unpack_frame, unpack_labels
+from unghost.core.shards.storage import read_shard
+from unghost.data_recipes.curation import SampleError, curate, sample_pair
+from unghost.data_recipes.meshes.files import load_mesh
+from unghost.data_recipes.meshes.library import Mesh
 from unghost.data_recipes.recipe import load_recipe
 
 

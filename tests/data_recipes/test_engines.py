@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from unghost.data_recipes import curate as curate_module
-from unghost.data_recipes.curate import curate
+from unghost.data_recipes import curation as curate_module
+from unghost.data_recipes.curation import curate
 from unghost.data_recipes.engines import ENGINES, LocalEngine, WorkerDied, open_engine, spans
 from unghost.data_recipes.recipe import Recipe
 
@@ -236,7 +236,7 @@ def test_ray_starts_its_own_cluster_and_ends_it(tmp_path):
     """In a process of its own, where none is running."""
     pytest.importorskip("ray")
     script = (
-        "import ray\nfrom pathlib import Path\nfrom unghost.data_recipes.curate import curate\n"
+        "import ray\nfrom pathlib import Path\nfrom unghost.data_recipes.curation import curate\n"
         "from unghost.data_recipes.recipe import Recipe\n"
         f"curate(Recipe(parts=(1, 2)), {str(tmp_path / 'out')!r}, count=9, seed=1, workers=2, engine='ray')\n"
         "assert not ray.is_initialized()\n"

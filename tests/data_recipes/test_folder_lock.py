@@ -10,10 +10,10 @@ import threading
 
 import pytest
 
-from unghost.data_recipes.curate import curate
+from unghost.data_recipes.curation import curate
 from unghost.data_recipes.folder_lock import locked
-from unghost.data_recipes.harvest import harvest
-from unghost.data_recipes.harvest_config import HarvestConfig
+from unghost.data_recipes.harvest.config import HarvestConfig
+from unghost.data_recipes.harvest.run import harvest
 from unghost.data_recipes.recipe import Recipe
 
 fcntl = pytest.importorskip("fcntl")

@@ -7,9 +7,9 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from unghost.core.packing import dequantize_signed, unpack_labels
-from unghost.core.shards import read_shard
-from unghost.data_recipes.curate import SampleError, curate
+from unghost.core.shards.packing import dequantize_signed, unpack_labels
+from unghost.core.shards.storage import read_shard
+from unghost.data_recipes.curation import SampleError, curate
 from unghost.data_recipes.online import OnlinePairs, PairBatch
 from unghost.data_recipes.recipe import Recipe, load_recipe
 

@@ -1,8 +1,6 @@
-import importlib.util
-from pathlib import Path
-
 import numpy as np
 import pytest
+from unghost_tests import textured_room
 
 
 @pytest.fixture
@@ -18,8 +16,5 @@ def pattern():
 
 @pytest.fixture(scope="session")
 def room():
-    """The module ``textured_room.py`` beside this file."""
-    spec = importlib.util.spec_from_file_location("textured_room", Path(__file__).with_name("textured_room.py"))
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    """The module of the textured room."""
+    return textured_room

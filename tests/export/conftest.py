@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import torch
 
-from unghost.bench import sample_channels
 from unghost.core.manifest import Manifest
-from unghost.export.parity import ParityInputs
-from unghost.export.quantize import calibration_inputs, export_precisions
-from unghost.export.to_onnx import export_onnx
+from unghost.export.onnx.parity import ParityInputs
+from unghost.export.onnx.quantization import calibration_inputs, export_precisions
+from unghost.export.onnx.to_onnx import export_onnx
 from unghost.prior.checkpoint import save_model
-from unghost.prior.network import NetworkConfig, RestorationNet
+from unghost.prior.networks.restoration import NetworkConfig, RestorationNet
+from unghost.speed import sample_channels
 
 
 def lively_network(config: NetworkConfig, seed: int = 0) -> RestorationNet:

@@ -12,7 +12,7 @@ import torch
 
 from unghost.core.manifest import Manifest
 from unghost.export.container import PRECISIONS, write_sealed
-from unghost.export.parity import TOLERANCES
+from unghost.export.onnx.parity import TOLERANCES
 from unghost.export.runtime import CHUNK, OnnxDenoiser, choose_providers, read_manifest
 
 

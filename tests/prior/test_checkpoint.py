@@ -7,7 +7,7 @@ from safetensors.torch import save_file
 
 from unghost.core.manifest import Manifest
 from unghost.prior.checkpoint import TorchDenoiser, load_model, read_tensors, save_model, write_tensors
-from unghost.prior.network import NetworkConfig, RestorationNet
+from unghost.prior.networks.restoration import NetworkConfig, RestorationNet
 
 TINY = NetworkConfig(widths=(8, 8, 8), condition_width=8)
 

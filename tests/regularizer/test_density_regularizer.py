@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 import torch
 
+from unghost.cleaning.pipeline import clean
 from unghost.core.cameras import Cameras
 from unghost.core.occupancy import OccupancyRule
-from unghost.regularizer.clean import clean
-from unghost.regularizer.regularizer import DensityRegularizer
+from unghost.regularizer.density_regularizer import DensityRegularizer
 from unghost.regularizer.settings import RegularizerSettings
 
 

@@ -10,10 +10,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from unghost.core.occupancy import OccupancyRule
-from unghost.regularizer.losses import cubewise_mean, dsds_loss, stable_mean, visibility_loss
-from unghost.regularizer.regularizer import DensityRegularizer
-from unghost.regularizer.rivals import (
+from unghost.baselines.losses import (
     depth_smoothness_loss,
     distortion_loss,
     free_space_loss,
@@ -23,6 +20,9 @@ from unghost.regularizer.rivals import (
     squash_density,
     total_variation_loss,
 )
+from unghost.core.occupancy import OccupancyRule
+from unghost.regularizer.density_regularizer import DensityRegularizer
+from unghost.regularizer.losses import cubewise_mean, dsds_loss, stable_mean, visibility_loss
 
 DTYPES = [torch.float16, torch.bfloat16, torch.float32, torch.float64]
 LARGEST = torch.finfo(torch.float64).max

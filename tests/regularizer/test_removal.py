@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from unghost.regularizer.keep_mask import KeepMask
+from unghost.cleaning.keep_mask import KeepMask
 from unghost.regularizer.removal import RemovalLoss
 
 BOX = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])

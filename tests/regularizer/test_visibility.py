@@ -7,13 +7,7 @@ import pytest
 from unghost.core.cameras import Cameras
 from unghost.core.frames import random_rotations
 from unghost.regularizer.view_grid import OPEN, ViewGrid, image_rectangles
-from unghost.regularizer.visibility import (
-    ViewCounter,
-    camera_sphere,
-    grow_box,
-    ray_points,
-    visibility_points,
-)
+from unghost.regularizer.visibility import ViewCounter, camera_sphere, grow_box, ray_points, visibility_points
 
 BOX = np.array([[-1.0, -1.0, -1.0], [1.0, 2.0, 1.0]])
 

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from unghost.core.cameras import Cameras
-from unghost.fields.furniture import FURNITURE, random_shape, random_texture
-from unghost.fields.scenes import _small_rotations, look_at, photograph, photograph_again, random_scene, sweep
-from unghost.fields.solids import PATTERNS, Solid, SolidScene
+from unghost.scenes.furniture import FURNITURE, random_shape, random_texture
+from unghost.scenes.generator import _small_rotations, look_at, photograph, photograph_again, random_scene, sweep
+from unghost.scenes.solids import PATTERNS, Solid, SolidScene
 
 
 def furnished(seed):

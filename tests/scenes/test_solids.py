@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from unghost.core.frames import random_rotations
-from unghost.fields.solids import PATTERNS, SHAPES, Light, Solid, SolidScene, Texture
+from unghost.scenes.solids import PATTERNS, SHAPES, Light, Solid, SolidScene, Texture
 
 RED, BLUE = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
 PLAIN = Texture(RED, RED)
@@ -29,7 +29,7 @@ def scene_of(names, seed, *, room=False):
 
 
 def test_every_exact_shape_is_covered():
-    assert set(EXACT) == set(SHAPES) - {"ellipsoid", "sampled"}  # a bound; and tests/core/test_sampled_distance.py
+    assert set(EXACT) == set(SHAPES) - {"ellipsoid", "sampled"}  # a bound; and tests/core/distances/test_sampled.py
 
 
 @pytest.mark.parametrize("room", [False, True])

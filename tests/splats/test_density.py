@@ -3,9 +3,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from unghost.fields import splats
-from unghost.fields.splat_ply import Gaussians
-from unghost.fields.splats import CUT, SplatField
+from unghost.splats import density as splats
+from unghost.splats.density import CUT, SplatField
+from unghost.splats.ply import Gaussians
 
 
 def cloud(count, seed=0, *, low=0.01, high=0.3, spread=1.0):

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
 
-from unghost.fields.splat_ply import KEEP_SCORE, Gaussians, read_splat_ply, write_splat_ply
+from unghost.splats.ply import KEEP_SCORE, Gaussians, read_splat_ply, write_splat_ply
 
 NAMES = [
     "x",

@@ -5,10 +5,10 @@ from unghost import cli
 from unghost.calibration import calibration_for
 from unghost.core.channels import UNKNOWN, encode_view_count
 from unghost.core.manifest import Manifest
-from unghost.core.packing import pack_labels
-from unghost.core.shards import write_shard
+from unghost.core.shards.packing import pack_labels
+from unghost.core.shards.storage import write_shard
 from unghost.prior.checkpoint import save_model
-from unghost.prior.network import NetworkConfig, RestorationNet
+from unghost.prior.networks.restoration import NetworkConfig, RestorationNet
 
 
 @pytest.fixture

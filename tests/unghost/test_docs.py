@@ -10,10 +10,10 @@ import pytest
 from unghost import cli
 from unghost.core.channels import CHANNEL_NAMES
 from unghost.core.manifest import FORMAT, METADATA_KEY, Manifest
-from unghost.core.packing import unpack_labels
-from unghost.core.shards import ARRAYS, read_shard
-from unghost.core.shards import FORMAT as SHARD_FORMAT
-from unghost.evaluation.conventions import CONVENTIONS, PLAIN_CONVENTIONS
+from unghost.core.shards.packing import unpack_labels
+from unghost.core.shards.storage import ARRAYS, read_shard
+from unghost.core.shards.storage import FORMAT as SHARD_FORMAT
+from unghost.evaluation.scoring.conventions import CONVENTIONS, PLAIN_CONVENTIONS
 
 ROOT = Path(__file__).resolve().parents[2]
 FORMATS = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from unghost.denoisers import load_denoiser
-from unghost.export.quantize import calibration_inputs, convert_onnx
+from unghost.export.onnx.quantization import calibration_inputs, convert_onnx
 
 ROOT = Path(__file__).resolve().parents[2]
 NEEDED = ("numpy", "onnxruntime")
@@ -76,7 +76,7 @@ def test_nothing_else_is_there(python):
 def test_every_precision_denoises_there_as_here(python, tmp_path):
     """The shipped model by name, and others from files: the numbers are those of this environment."""
     from unghost.denoisers import WEIGHTS
-    from unghost.export.to_onnx import export_onnx
+    from unghost.export.onnx.to_onnx import export_onnx
 
     export_onnx(WEIGHTS / "default.safetensors", tmp_path / "fp32.onnx")
     cubes = np.random.default_rng(0).uniform(-1, 1, (3, 1, 32, 32, 32)).astype(np.float32)

@@ -51,7 +51,7 @@ def test_the_base_install_imports_and_has_a_cleaner():
         for module in pkgutil.iter_modules(unghost.core.__path__, "unghost.core."):
             importlib.import_module(module.name)
         import unghost.export.runtime
-        import unghost.cli, unghost.commands, unghost.grids
+        import unghost.cli, unghost.cli.prior, unghost.fields.adapters.grids
         assert callable(unghost.clean) and callable(unghost.load_denoiser)
         assert isinstance(unghost.KeepMask, type)
         unghost.export.runtime.OnnxDenoiser
@@ -95,7 +95,7 @@ def test_the_regularizer_names_its_extra():
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize("package", ["torch", "scipy.ndimage", "onnx", "unghost.prior.network"])
+@pytest.mark.parametrize("package", ["torch", "scipy.ndimage", "onnx", "unghost.prior.networks.restoration"])
 def test_the_guard_can_fail(package):
     done = run(f"import {package}")
     assert done.returncode != 0

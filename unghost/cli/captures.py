@@ -40,8 +40,8 @@ def capture(
     """
     from tqdm import tqdm
 
-    from .evaluation.new_capture import make_capture
-    from .evaluation.posing import PosingSettings
+    from ..evaluation.captures.creation import make_capture
+    from ..evaluation.captures.posing import PosingSettings
 
     settings = PosingSettings(
         one_lens=one_lens, longest_side=longest_side, minimum_share=minimum_share, seed=seed, threads=threads
@@ -102,9 +102,9 @@ def convert(
         link: symbolic links to the photos instead of copies.
         plot: PNG for a bird's-eye view of both sweeps.
     """
-    from .evaluation.difficulty import every_nth
-    from .evaluation.nerfstudio_folder import write_nerfstudio
-    from .evaluation.splits import TRAIN_NAMES, choose_split
+    from ..evaluation.captures.difficulty import every_nth
+    from ..evaluation.captures.nerfstudio import write_nerfstudio
+    from ..evaluation.captures.splits import TRAIN_NAMES, choose_split
 
     if plot is not None:
         _check_plot(plot, "convert")
@@ -140,7 +140,7 @@ def _check_plot(path: Path, verb: str) -> None:
 
 def _read(folder: Path, splits: Path | None, missing: str, photos: Path | None) -> tuple[Any, list[str]]:
     """The capture as it is stored, and what reading it gave to say."""
-    from .evaluation.captures import load_capture
+    from ..evaluation.captures.loading import load_capture
 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -149,7 +149,7 @@ def _read(folder: Path, splits: Path | None, missing: str, photos: Path | None) 
 
 
 def _sweeps(posed: Any, train: str | None, evaluation: str | None) -> tuple[Any, Any]:
-    from .evaluation.splits import EVAL_NAMES, TRAIN_NAMES, choose_split
+    from ..evaluation.captures.splits import EVAL_NAMES, TRAIN_NAMES, choose_split
 
     return (
         posed.split(choose_split(posed.splits, train, TRAIN_NAMES, "--train-split")),
@@ -159,8 +159,8 @@ def _sweeps(posed: Any, train: str | None, evaluation: str | None) -> tuple[Any,
 
 def _report(posed: Any, train: Any, evaluation: Any, plot: Path | None, *, held_out: int | None = None) -> None:
     """Print the difficulty, and draw the sweeps if asked to; ``held_out``: the evaluation is every so many-th photo."""
-    from .evaluation.birds_eye import draw_birds_eye
-    from .evaluation.difficulty import difficulty_rows, difficulty_text
+    from ..evaluation.captures.birds_eye import draw_birds_eye
+    from ..evaluation.captures.difficulty import difficulty_rows, difficulty_text
 
     taught, scored = posed.cameras.select(train), posed.cameras.select(evaluation)
     rows = difficulty_rows(taught, scored)

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from .commands import Threads
+from .prior import Threads
 
 if TYPE_CHECKING:
-    from .regularizer.keep_mask import KeepMask
+    from ..cleaning.keep_mask import KeepMask
 
 Box = tuple[float, float, float, float, float, float]
 
@@ -54,7 +54,7 @@ def clean(
         scores_only: of splats, write all of them with their keep_score, and remove none.
         threads: of onnxruntime; 0 leaves the choice to it.
     """
-    from .regularizer.keep_mask import KeepMask
+    from ..cleaning.keep_mask import KeepMask
 
     splats = source.suffix == ".ply"
     target = None if preview else out or source.with_name(f"{source.stem}-clean{source.suffix}")
@@ -93,8 +93,8 @@ def clean(
 
 def _judging(denoiser: str, threads: int, strength: float, cameras: Path | None) -> dict[str, Any]:
     """What ``clean`` is given to judge with."""
-    from .denoisers import load_denoiser
-    from .evaluation.captures import load_cameras
+    from ..denoisers import load_denoiser
+    from ..evaluation.captures.loading import load_cameras
 
     return {
         "denoiser": load_denoiser(denoiser, backend="onnx", threads=threads or None),
@@ -116,8 +116,8 @@ def _check_distinct(**files: Path | None) -> None:
 def _clean_grid(
     source: Path, target: Path | None, mask: KeepMask | None = None, **options: Any
 ) -> tuple[KeepMask, Callable[[Any], Any]]:
-    from .cleaning import clean
-    from .grids import cell_pitch, grid_density_fn, load_grid, save_grid
+    from ..facade import clean
+    from ..fields.adapters.grids import cell_pitch, grid_density_fn, load_grid, save_grid
 
     density, aabb = load_grid(source)
     density_fn = grid_density_fn(density, aabb)
@@ -131,7 +131,7 @@ def _clean_grid(
 
 
 def _clean_splats(source: Path, target: Path | None, **options: Any) -> tuple[KeepMask, Callable[[Any], Any]]:
-    from .splat_cleaning import clean_ply
+    from ..facade import clean_ply
 
     found = clean_ply(source, target, **options)
     gone = int((~found.keep).sum())

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any, Literal
 from tyro.conf import Positional
 
 if TYPE_CHECKING:
-    from .core.cameras import Cameras
-    from .evaluation.conventions import SceneExtent
-    from .evaluation.perceptual import Lpips
-    from .evaluation.renders_folder import Method
-    from .evaluation.views import Truth
+    from ..core.cameras import Cameras
+    from ..evaluation.metrics.perceptual import Lpips
+    from ..evaluation.scoring.conventions import SceneExtent
+    from ..evaluation.scoring.renders import Method
+    from ..evaluation.scoring.views import Truth
 
 CAPTION_KEYS = ("psnr", "ssim", "coverage")
 
@@ -76,8 +76,8 @@ def evaluate(
     """
     import numpy as np
 
-    from .core.results import build_results
-    from .evaluation.comparison import choose_convention, compare_methods
+    from ..core.results import build_results
+    from ..evaluation.scoring.comparison import choose_convention, compare_methods
 
     key = _sort_key(sort, metrics)  # refused before anything is read
     if not renders:
@@ -118,7 +118,7 @@ def report(results: Positional[Path], out: Path | None = None) -> None:
         results: JSON as unghost evaluate and the benchmarks write it (docs/formats.md).
         out: the page; RESULTS with the ending .html unless given.
     """
-    from .evaluation.page import read_results, write_page
+    from ..evaluation.report.page import read_results, write_page
 
     target = results.with_suffix(".html") if out is None else out
     write_page(target, read_results(results))
@@ -127,7 +127,7 @@ def report(results: Positional[Path], out: Path | None = None) -> None:
 
 def _sort_key(sort: str | None, metrics: Sequence[str]) -> str:
     """What the views are sorted by: it must be computed."""
-    from .evaluation.page_pictures import worst_first
+    from ..evaluation.report.pictures import worst_first
 
     key = sort or ("psnr" if not metrics or "psnr" in metrics else metrics[0])
     worst_first([], key)
@@ -163,8 +163,8 @@ class _Scene:
 
 
 def _methods(folders: Mapping[str, Path], scene: _Scene, depth_along: str) -> list[Method]:
-    from .evaluation.protocol import ray_depth
-    from .evaluation.renders_folder import read_method
+    from ..evaluation.scoring.protocol import ray_depth
+    from ..evaluation.scoring.renders import read_method
 
     shape = scene.truth.photos.shape[1], scene.truth.photos.shape[2]
     methods = [read_method(name, folder, scene.truth.names, shape) for name, folder in folders.items()]
@@ -190,11 +190,11 @@ def _scene(
     occlusion: bool | None,
     min_views: int,
 ) -> _Scene:
-    from .evaluation.colmap import find_model
-    from .evaluation.conventions import SceneExtent
-    from .evaluation.pseudo import check_cameras, load_pseudo_truth
-    from .evaluation.renders_folder import read_masks, read_photos
-    from .evaluation.views import Truth
+    from ..evaluation.captures.colmap import find_model
+    from ..evaluation.scoring.conventions import SceneExtent
+    from ..evaluation.scoring.pseudo_truth import check_cameras, load_pseudo_truth
+    from ..evaluation.scoring.renders import read_masks, read_photos
+    from ..evaluation.scoring.views import Truth
 
     cameras = train_cameras = extent = None
     stored = None if masks is None or masks.is_dir() else load_pseudo_truth(masks)
@@ -243,9 +243,9 @@ def _capture(
 ) -> tuple[tuple[str, ...], Any, Cameras, Cameras | None]:
     import numpy as np
 
-    from .evaluation.captures import load_capture
-    from .evaluation.renders_folder import match_names
-    from .evaluation.splits import EVAL_NAMES, TRAIN_NAMES, choose_split
+    from ..evaluation.captures.loading import load_capture
+    from ..evaluation.captures.splits import EVAL_NAMES, TRAIN_NAMES, choose_split
+    from ..evaluation.scoring.renders import match_names
 
     capture = load_capture(folder, downscale=downscale, normalize=normalize)
     split = choose_split(capture.splits, eval_split, EVAL_NAMES, "evaluate: --eval-split", whole=True)
@@ -264,7 +264,7 @@ def _capture(
 
 def _network(backbone: str, metrics: Sequence[str]) -> tuple[Lpips | None, list[str]]:
     """LPIPS, or none and why; an error only if it was named among the metrics."""
-    from .evaluation.perceptual import LpipsUnavailable, load_lpips
+    from ..evaluation.metrics.perceptual import LpipsUnavailable, load_lpips
 
     if backbone == "none":
         return None, []
@@ -278,8 +278,8 @@ def _network(backbone: str, metrics: Sequence[str]) -> tuple[Lpips | None, list[
 
 def _not_proper(asked: str | None, name: str, methods: Sequence[Method], scene: _Scene) -> list[str]:
     """Why a convention that nobody named is not the default one."""
-    from .evaluation.comparison import in_words, lacking_maps
-    from .evaluation.conventions import DEFAULT_CONVENTION
+    from ..evaluation.scoring.comparison import in_words, lacking_maps
+    from ..evaluation.scoring.conventions import DEFAULT_CONVENTION
 
     if asked is not None or name == DEFAULT_CONVENTION:
         return []
@@ -291,7 +291,7 @@ def _not_proper(asked: str | None, name: str, methods: Sequence[Method], scene: 
 def _details(
     gt: Path, scene: _Scene, rows: Sequence[Mapping[str, Any]], references: Sequence[str], convention: str, sort: str
 ) -> dict[str, Any]:
-    from .evaluation.page_pictures import PHOTO
+    from ..evaluation.report.pictures import PHOTO
 
     main = rows[len(references) % len(rows)]
     images, photos, extent = main["per_image"], scene.truth.photos, scene.extent
@@ -315,10 +315,10 @@ def _details(
 
 
 def _write(out: Path, results: Mapping[str, Any], methods: Sequence[Method], scene: _Scene, pairs: int) -> None:
-    from .core.results import write_results
-    from .evaluation.conventions import evaluation_masks, get_convention
-    from .evaluation.page import write_page
-    from .evaluation.page_pictures import view_pictures, worst_first
+    from ..core.results import write_results
+    from ..evaluation.report.page import write_page
+    from ..evaluation.report.pictures import view_pictures, worst_first
+    from ..evaluation.scoring.conventions import evaluation_masks, get_convention
 
     rows, facts = results["rows"], results["evaluation"]
     rule = get_convention(facts["convention"])
@@ -346,8 +346,8 @@ def _write_images(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _say(results: Mapping[str, Any]) -> None:
-    from .evaluation.page_tables import EQUAL_KEYS, OWN_KEYS, present
-    from .evaluation.report import format_table
+    from ..evaluation.report.rows import format_table
+    from ..evaluation.report.tables import EQUAL_KEYS, OWN_KEYS, present
 
     rows = results["rows"]
     shown = [{**row, **{key: float("inf") for key in row["infinite"]}} for row in rows]

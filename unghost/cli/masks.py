@@ -60,9 +60,9 @@ def masks(
     import numpy as np
     from PIL import Image
 
-    from .evaluation.captures import load_capture
-    from .evaluation.protocol import ray_depth
-    from .evaluation.pseudo import make_pseudo_truth
+    from ..evaluation.captures.loading import load_capture
+    from ..evaluation.scoring.protocol import ray_depth
+    from ..evaluation.scoring.pseudo_truth import make_pseudo_truth
 
     posed = load_capture(capture, downscale=downscale, normalize=normalize)
     views, taught = posed.split(eval_split), posed.split(train_split)

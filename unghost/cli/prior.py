@@ -17,7 +17,7 @@ def demo(out: Path = Path("out/demo"), seed: int = 0) -> None:
         out: folder for index.html, result.json and the pictures.
         seed: of the room and its ghosts.
     """
-    from .demo import run_demo, summary_table
+    from ..demo.run import run_demo, summary_table
 
     results = run_demo(out, seed=seed)
     print(summary_table(results))
@@ -36,9 +36,9 @@ def bench(
         seconds: how long to measure, after three calls to warm up.
         out: also write the result as JSON here.
     """
-    from .bench import measure_speed
-    from .core.results import build_results, write_results
-    from .denoisers import load_denoiser
+    from ..core.results import build_results, write_results
+    from ..denoisers import load_denoiser
+    from ..speed import measure_speed
 
     model = load_denoiser(denoiser, backend="onnx", threads=threads or None)
     row = measure_speed(model, batch=batch, seconds=seconds)

@@ -35,8 +35,8 @@ def curate(
         engine: where the workers run; ray uses the cluster of RAY_ADDRESS, or else starts one on this machine.
         shard_length: pairs a shard, 41 kB each on disk and in memory.
     """
-    from .data_recipes.curate import curate as make
-    from .data_recipes.recipe import load_recipe
+    from ..data_recipes.curation import curate as make
+    from ..data_recipes.recipe import load_recipe
 
     shards = make(
         load_recipe(recipe),
@@ -81,8 +81,8 @@ def harvest(
             held out: harvest it apart, with another seed, for evaluation.
         mesh_root: a folder of meshes with its manifest.csv; some of its train split stand in the scenes then.
     """
-    from .data_recipes.harvest import harvest as make
-    from .data_recipes.harvest_config import HarvestConfig
+    from ..data_recipes.harvest.config import HarvestConfig
+    from ..data_recipes.harvest.run import harvest as make
 
     given: dict[str, Any] = {} if cubes is None else {"cubes": cubes}
     if kinds:
@@ -124,7 +124,7 @@ def preview(
         seed: of the choice of cubes.
         against: another shard or folder; the page states how unlike the two are.
     """
-    from .data_recipes.preview import write_preview
+    from ..data_recipes.inspection.preview import write_preview
 
     page, facts = write_preview(folder, out=out, cubes=cubes, seed=seed, against=against)
     print(

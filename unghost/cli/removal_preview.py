@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .core.occupancy import OccupancyRule
-from .data_recipes.render import GHOST, png_bytes
-from .regularizer.keep_mask import KeepMask, lattice_axes
-from .regularizer.queries import make_query
+from ..cleaning.keep_mask import KeepMask
+from ..cleaning.queries import make_query
+from ..core.lattice import lattice_axes
+from ..core.occupancy import OccupancyRule
+from ..data_recipes.inspection.drawing import GHOST, png_bytes
 
 SIDE = 420  # pixels that the longest side of the box takes at least
 GAP = 12

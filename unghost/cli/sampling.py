@@ -42,9 +42,9 @@ def sample(
         import torch
         from tqdm import tqdm
 
-        from .prior.checkpoint import load_model
-        from .prior.diffusion_network import DiffusionNet
-        from .prior.sampling import sample_cubes
+        from ..prior.checkpoint import load_model
+        from ..prior.diffusion.model import DiffusionNet
+        from ..prior.diffusion.sampling import sample_cubes
     except ModuleNotFoundError as error:
         if error.name not in ("torch", "safetensors"):
             raise
@@ -90,8 +90,8 @@ def write_samples(out: Path, signed: NDArray[Any], facts: dict[str, Any]) -> Non
 
     import numpy as np
 
-    from .core.occupancy import DECISION
-    from .data_recipes.render import png_bytes
+    from ..core.occupancy import DECISION
+    from ..data_recipes.inspection.drawing import png_bytes
 
     out.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(
@@ -107,7 +107,7 @@ def draw_cube(occupancy: NDArray[Any]) -> NDArray[Any]:
     """``(R, R, R)`` bool as a surface, ``(W, W, 3)`` uint8, turned to the side that shows most of it."""
     import numpy as np
 
-    from .data_recipes.render import SURFACE, best_turn, render_cube
+    from ..data_recipes.inspection.drawing import SURFACE, best_turn, render_cube
 
     opacity = occupancy.astype(np.float32)
     turned = np.rot90(opacity, best_turn(opacity, opacity))

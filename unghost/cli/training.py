@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from tyro.conf import Positional, UseAppendAction
 
 if TYPE_CHECKING:
-    from .prior.config import TrainConfig
+    from ..prior.training.config import TrainConfig
 
 ONLINE_SEED = 1 << 32  # plus the run's seed: what is made online is in no shard
 
@@ -24,7 +24,7 @@ def expand_shards(spec: str) -> list[tuple[Path, float]]:
     Raises:
         ValueError: the weight is no positive number, or there is no shard.
     """
-    from .core.shards import read_shard
+    from ..core.shards.storage import read_shard
 
     name, separator, number = spec.rpartition("=")
     folder = Path(name if separator else spec)
@@ -58,9 +58,9 @@ def _named_shards(specs: list[str]) -> dict[str, Path]:
 
 def _online(specs: list[str], *, seed: int, workers: int, mesh_root: Path | None) -> list[Any]:
     """``RECIPE=SHARE`` to sources of pairs."""
-    from .data_recipes.online import OnlinePairs
-    from .data_recipes.recipe import load_recipe
-    from .prior.blend import Online
+    from ..data_recipes.online import OnlinePairs
+    from ..data_recipes.recipe import load_recipe
+    from ..prior.training.blend import Online
 
     sources = []
     for spec in specs:
@@ -78,8 +78,8 @@ def _online(specs: list[str], *, seed: int, workers: int, mesh_root: Path | None
 
 def _configured(file: Path | None, size: str | None, channels: tuple[str, ...], given: dict[str, Any]) -> TrainConfig:
     """The configuration of a file, or the default one, with what the command line says in its place."""
-    from .prior.config import TrainConfig
-    from .prior.network import SIZES, NetworkConfig
+    from ..prior.networks.restoration import SIZES, NetworkConfig
+    from ..prior.training.config import TrainConfig
 
     base = TrainConfig() if file is None else TrainConfig.from_dict(json.loads(file.read_text(encoding="utf-8")))
     if size is not None and size not in SIZES:
@@ -145,8 +145,8 @@ def train(
         mesh_root: folder with the meshes and their manifest.csv, for recipes that read meshes.
         resume: go on where a killed run stopped.
     """
-    from .prior.allocator import keep_freed_memory
-    from .prior.train import train as run
+    from ..prior.training.allocator import keep_freed_memory
+    from ..prior.training.loop import train as run
 
     keep_freed_memory()
     given: dict[str, Any] = {
@@ -199,10 +199,10 @@ def export(
         calibration_cubes: how many of them.
         seed: of a recipe's cubes.
     """
-    from .calibration import calibration_for
-    from .export.quantize import export_precisions
-    from .export.runtime import read_manifest
-    from .export.to_onnx import export_onnx
+    from ..calibration import calibration_for
+    from ..export.onnx.quantization import export_precisions
+    from ..export.onnx.to_onnx import export_onnx
+    from ..export.runtime import read_manifest
 
     if precision:
         inputs = None
@@ -236,9 +236,9 @@ def verify(
         seed: of the cubes.
         out: also write the result as JSON here.
     """
-    from .core.results import build_results, write_results
-    from .denoisers import WEIGHTS
-    from .export.parity import verify as run
+    from ..core.results import build_results, write_results
+    from ..denoisers import WEIGHTS
+    from ..export.onnx.parity import verify as run
 
     onnx, checkpoint = onnx or WEIGHTS / "default.onnx", checkpoint or WEIGHTS / "default.safetensors"
     report = run(onnx, checkpoint, cubes=cubes, seed=seed)

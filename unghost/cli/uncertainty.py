@@ -44,11 +44,11 @@ def doubt(
     """
     import numpy as np
 
-    from .evaluation.captures import load_capture
-    from .evaluation.protocol import ray_depth
-    from .evaluation.renders_folder import read_map, read_method
-    from .evaluation.splits import EVAL_NAMES, TRAIN_NAMES, choose_split
-    from .regularizer.photo_doubt import UNSEEN, photo_doubt
+    from ..evaluation.captures.loading import load_capture
+    from ..evaluation.captures.splits import EVAL_NAMES, TRAIN_NAMES, choose_split
+    from ..evaluation.scoring.protocol import ray_depth
+    from ..evaluation.scoring.renders import read_map, read_method
+    from ..evaluation.uncertainty.photometric import UNSEEN, photo_doubt
 
     capture = load_capture(gt, downscale=downscale, normalize=normalize)
     views = capture.split(choose_split(capture.splits, eval_split, EVAL_NAMES, "doubt: --eval-split"))

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .core.occupancy import OccupancyRule, opacity_from_density
-from .demo_render import Floats, look_at, render, shade
-from .demo_room import AABB, Room
+from ..core.occupancy import OccupancyRule, opacity_from_density
+from ..scenes.labelled_room.room import AABB, Room
+from ..scenes.volume_renderer import Floats, look_at, render, shade
 
 Mask = NDArray[np.bool_]
 CAMERA = look_at((6.0, -6.0, 4.9), (-0.1, 0.1, 0.72), width=800, height=600, fov_degrees=40.0)

@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .cleaning import clean
-from .core.occupancy import OccupancyRule
-from .core.results import build_results, write_results
-from .demo_ghosts import KINDS
-from .demo_room import AABB, SHAPE, Room, build_room
-from .denoisers import load_denoiser
-from .grids import cell_centers, grid_density_fn
+from ..core.occupancy import OccupancyRule
+from ..core.results import build_results, write_results
+from ..denoisers import load_denoiser
+from ..facade import clean
+from ..fields.adapters.grids import cell_centers, grid_density_fn
+from ..scenes.labelled_room.ghosts import KINDS
+from ..scenes.labelled_room.room import AABB, SHAPE, Room, build_room
 
 Mask = NDArray[np.bool_]
 RULE = OccupancyRule()
@@ -109,8 +109,8 @@ def run_demo(out: str | Path, *, seed: int = 0, denoiser: Any = None) -> dict[st
     Returns:
         The results object that was written.
     """
-    from .demo_page import write_page
-    from .demo_pictures import draw_pictures
+    from .page import write_page
+    from .pictures import draw_pictures
 
     folder = Path(out)
     start = time.perf_counter()

@@ -1,20 +1,17 @@
-"""The parts of benchmarks/curate.py, each with little to do."""
+"""The parts of benchmarks/data/curate.py, each with little to do."""
 
-import importlib
 import json
 from collections import Counter
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+from benchmarks.data import cube_makers, curate
 
 
 @pytest.fixture
 def bench(monkeypatch):
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    module, ways = importlib.import_module("curate"), importlib.import_module("curate_ways")
+    module, ways = curate, cube_makers
     small = module.Mesh.from_triangles(module.bumpy_ball(2000))
     for each in (module, ways):
         monkeypatch.setattr(each, "ball", lambda faces=0: small)
@@ -32,7 +29,7 @@ def test_the_ball_is_closed_and_has_about_the_faces_asked_for(bench):
 
 def test_our_cubes_are_checked_and_a_wrong_one_is_found(bench, monkeypatch):
     bench.check_meshes(2)
-    ways = importlib.import_module("curate_ways")
+    ways = cube_makers
     monkeypatch.setattr(ways, "cut_cubes", lambda mesh, frames: np.ones((len(frames), 32, 32, 32), dtype=bool))
     with pytest.raises(AssertionError):
         bench.check_meshes(1)
@@ -40,7 +37,7 @@ def test_our_cubes_are_checked_and_a_wrong_one_is_found(bench, monkeypatch):
 
 def test_solids_are_checked_and_wrong_ones_are_found(bench, monkeypatch):
     pytest.importorskip("manifold3d")
-    csg = importlib.import_module("curate_ways").csg
+    csg = cube_makers.csg
     bench.check_solids(2)
     for name, wrong in (
         ("cut_cubes", lambda mesh, frames: np.zeros((len(frames), 32, 32, 32), dtype=bool)),
@@ -53,7 +50,7 @@ def test_solids_are_checked_and_wrong_ones_are_found(bench, monkeypatch):
 
 
 def test_winding_numbers_by_hand(bench):
-    ways = importlib.import_module("curate_ways")
+    ways = cube_makers
     points = np.array([[0.0, 0.0, 0.0], [0.5, 0.3, -0.2], [3.0, 0.0, 0.0]])
     np.testing.assert_allclose(ways.winding_numbers(bench.bumpy_ball(1200), points), [1, 1, 0], atol=1e-9)
 

@@ -1,8 +1,5 @@
 """The reference measurement's parts: classical rivals, scores, the figure's front, the capture's labels."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -10,38 +7,25 @@ pytest.importorskip("scipy")
 pytest.importorskip("torch")
 pytest.importorskip("tyro")
 
+from benchmarks.denoise import capture_cubes, channels_study, figure, run, scores, sets, speed
+from unghost.baselines import filters
 from unghost.core.cameras import Cameras
 from unghost.core.occupancy import FREE_LABEL, IGNORE_LABEL, SURFACE_LABEL
-
-BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 
 
 @pytest.fixture(scope="module")
 def parts():
-    """The modules of the benchmarks' folder."""
-    sys.path.insert(0, str(BENCHMARKS))
-    try:
-        import capture_cubes
-        import channels_study
-        import classical
-        import denoise
-        import denoise_figure
-        import denoise_scores
-        import denoise_sets
-        import denoise_speed
-
-        yield {
-            "classical": classical,
-            "scores": denoise_scores,
-            "sets": denoise_sets,
-            "figure": denoise_figure,
-            "capture": capture_cubes,
-            "denoise": denoise,
-            "speed": denoise_speed,
-            "study": channels_study,
-        }
-    finally:
-        sys.path.remove(str(BENCHMARKS))
+    """The modules of the reference measurement."""
+    return {
+        "classical": filters,
+        "scores": scores,
+        "sets": sets,
+        "figure": figure,
+        "capture": capture_cubes,
+        "denoise": run,
+        "speed": speed,
+        "study": channels_study,
+    }
 
 
 def plate(thick=3):
@@ -254,8 +238,8 @@ def test_a_diffusion_is_asked_in_more_ways_than_a_restoration(parts):
 
 def test_the_study_shows_bits_where_it_says_so_and_keeps_the_truth(parts, tmp_path):
     from unghost.core.occupancy import opacity_from_signed
-    from unghost.core.packing import dequantize_signed, pack_labels
-    from unghost.core.shards import read_shard, write_shard
+    from unghost.core.shards.packing import dequantize_signed, pack_labels
+    from unghost.core.shards.storage import read_shard, write_shard
 
     rng = np.random.default_rng(0)
     arrays = {

@@ -1,7 +1,5 @@
 """The field that benchmarks of the regularizer train, and the holes that they tear."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -10,10 +8,10 @@ pytest.importorskip("tyro")
 
 import torch
 
-from unghost.demo_room import AABB, SHAPE, build_room
-from unghost.grids import cell_centers
-
-BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
+from benchmarks.regularizer.filling import RULE, torn
+from benchmarks.regularizer.grid_field import GridField
+from unghost.fields.adapters.grids import cell_centers
+from unghost.scenes.labelled_room.room import AABB, SHAPE, build_room
 
 
 @pytest.fixture(scope="module")
@@ -21,10 +19,7 @@ def room():
     return build_room(20)
 
 
-def test_it_holds_what_it_was_given_at_the_centres_and_can_grow_anywhere(monkeypatch, room):
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    from grid_field import GridField
-
+def test_it_holds_what_it_was_given_at_the_centres_and_can_grow_anywhere(room):
     field = GridField(room.true_density, room.pitch)
     cells = field.cells().detach().numpy()
     assert cells.shape == SHAPE
@@ -37,10 +32,7 @@ def test_it_holds_what_it_was_given_at_the_centres_and_can_grow_anywhere(monkeyp
     assert (field.table.grad[:, 0] > 0).sum() >= 400  # where there is nothing, too
 
 
-def test_holes_are_part_of_the_solid_and_leave_most_of_it(monkeypatch, room):
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    from regularizer_fill import RULE, torn
-
+def test_holes_are_part_of_the_solid_and_leave_most_of_it(room):
     again, solid, missing = torn(20)
     np.testing.assert_array_equal(again.true_density, room.true_density)
     assert not (solid & ~room.surface(RULE)).any()

@@ -1,22 +1,11 @@
-import sys
 from pathlib import Path
 
 import pytest
 import torch
 
-ROOT = Path(__file__).resolve().parents[2]
+from benchmarks.regularizer import stability as STABILITY
 
-
-def load():
-    sys.path.insert(0, str(ROOT / "benchmarks"))
-    try:
-        import stability
-    finally:
-        sys.path.pop(0)
-    return stability
-
-
-STABILITY = load()
+ROOT = Path(__file__).resolve().parents[3]
 TYPES = (torch.float32, torch.float16, torch.bfloat16)
 LIMITS = {  # elsewhere 1e-6
     "a smooth field": (1e-8, 1e-4, 1e-3),
@@ -41,10 +30,12 @@ def rows_of(case):
 def test_hostile_numbers(case):
     """The behaviour of every row in every type, its error, and the error that the document has for it."""
     assert set(case.types) <= set(TYPES)
-    assert len(rows_of(case)) == 1, f"run benchmarks/stability.py again: {case.given}"
+    assert len(rows_of(case)) == 1, f"run benchmarks/regularizer/stability.py again: {case.given}"
     for column, dtype in enumerate(TYPES):
         error, written = case.check(dtype) if dtype in case.types else None, rows_of(case)[0][2 + column]
-        assert (error is None) == (written == "–"), f"run benchmarks/stability.py again: {case.given}, {dtype}"
+        assert (error is None) == (written == "–"), (
+            f"run benchmarks/regularizer/stability.py again: {case.given}, {dtype}"
+        )
         if error is not None:
             limit = dict(zip(TYPES, LIMITS.get(case.given, ()))).get(dtype, 1e-6)
             assert error <= limit

@@ -1,13 +1,11 @@
 """No number stands in the README's results that docs/results does not hold."""
 
-import importlib.util
 import json
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
-SPEC = importlib.util.spec_from_file_location("readme", ROOT / "benchmarks" / "readme.py")
-readme = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(readme)
+from benchmarks.release import readme
+
+ROOT = Path(__file__).resolve().parents[3]
 
 
 def test_the_section_is_what_the_results_say():

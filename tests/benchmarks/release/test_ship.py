@@ -2,7 +2,6 @@
 
 import json
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,24 +9,15 @@ import torch
 
 pytest.importorskip("tyro")
 
+from benchmarks.release import ship
 from unghost import load_denoiser
 from unghost.core.manifest import Manifest
 from unghost.prior.checkpoint import save_model
-from unghost.prior.network import NetworkConfig, RestorationNet, parameter_count
-
-BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
+from unghost.prior.networks.restoration import NetworkConfig, RestorationNet, parameter_count
 
 
 @pytest.fixture
-def ship(monkeypatch):
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    import ship
-
-    return ship
-
-
-@pytest.fixture
-def options(ship, tmp_path):
+def options(tmp_path):
     torch.manual_seed(0)
     network = RestorationNet(NetworkConfig(widths=(8, 8, 8)))
     save_model(tmp_path / "model.safetensors", network, Manifest("m", parameters=parameter_count(network)))
@@ -44,7 +34,7 @@ def kept_until(threshold):
     return row_of
 
 
-def test_the_largest_threshold_that_keeps_enough(ship, options, monkeypatch):
+def test_the_largest_threshold_that_keeps_enough(options, monkeypatch):
     monkeypatch.setattr(ship, "row_of", kept_until(0.2))
     chosen, rows = ship.choose(None, options)
     assert chosen == 0.2
@@ -55,7 +45,7 @@ def test_the_largest_threshold_that_keeps_enough(ship, options, monkeypatch):
 
 
 @pytest.mark.parametrize("half", [False, True])
-def test_the_files_hold_the_threshold_and_agree(ship, options, half, monkeypatch, tmp_path):
+def test_the_files_hold_the_threshold_and_agree(options, half, monkeypatch, tmp_path):
     monkeypatch.setattr(ship, "row_of", kept_until(0.1))
     options.weights.mkdir()
     words = [str(options.checkpoint), "mine", "--out", str(tmp_path), "--weights", str(options.weights)]

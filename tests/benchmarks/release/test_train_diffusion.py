@@ -1,22 +1,18 @@
-"""benchmarks/train_diffusion.py with hardly anything to do."""
+"""benchmarks/release/train_diffusion.py with hardly anything to do."""
 
-import importlib
 import json
-from pathlib import Path
 
 import pytest
 
+from benchmarks.release import train_diffusion
 from unghost.prior.checkpoint import load_model
-from unghost.prior.config import TrainConfig
-from unghost.prior.unet import UNetConfig
-
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+from unghost.prior.networks.unet import UNetConfig
+from unghost.prior.training.config import TrainConfig
 
 
 @pytest.fixture
 def bench(monkeypatch, tiny_config):
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    module = importlib.import_module("train_diffusion")
+    module = train_diffusion
     runs = {
         name: TrainConfig(objective=run.objective, network=tiny_config.network) for name, run in module.RUNS.items()
     }

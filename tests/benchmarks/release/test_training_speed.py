@@ -2,20 +2,16 @@
 
 import json
 import sys
-from pathlib import Path
 
 import pytest
 
 pytest.importorskip("torch")
 pytest.importorskip("tyro")
 
-BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
+from benchmarks.release import training_speed
 
 
 def test_loader_network_and_both(shard_paths, tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    import training_speed
-
     monkeypatch.setattr(training_speed.torch, "set_num_threads", lambda count: None)  # other tests keep theirs
     monkeypatch.setattr(training_speed, "keep_freed_memory", lambda: True)
     monkeypatch.setattr(

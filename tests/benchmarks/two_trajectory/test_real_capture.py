@@ -1,8 +1,6 @@
-"""The whole of benchmarks/capture.py on a capture of a few pixels, with the real field and regularizer."""
+"""All of benchmarks/two_trajectory/real_capture.py on a capture of a few pixels, with the real field."""
 
-import importlib
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,9 +8,8 @@ from PIL import Image
 
 pytest.importorskip("torch")
 
+from benchmarks.two_trajectory import real_capture
 from unghost.core.manifest import Manifest
-
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 
 
 class Hollow:
@@ -27,8 +24,7 @@ class Hollow:
 
 @pytest.fixture
 def bench(monkeypatch):
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    module = importlib.import_module("capture")
+    module = real_capture
     monkeypatch.setattr(module, "load_denoiser", lambda name: Hollow())
     monkeypatch.setattr(module, "code_hash", lambda *packages: "this code")
     return module
@@ -154,6 +150,7 @@ def test_bad_options_are_named_before_anything_is_fitted(bench, capture, tmp_pat
 def test_the_command_names_no_folder(bench, capture, tmp_path):
     options = _options(bench, capture, tmp_path)
     assert options.command() == (
-        "python benchmarks/capture.py tiny --train one --eval two --seeds 0 1 --downscale 2 --finetune-steps 2 "
+        "python -m benchmarks.two_trajectory.real_capture tiny --train one --eval two --seeds 0 1 --downscale 2 "
+        "--finetune-steps 2 "
         "--steps 3 --resolution 16 --settings cubes=1 visibility_samples=64"
     )

@@ -1,4 +1,4 @@
-"""Parts of benchmarks/two_trajectory.py: what its tables say, and each method on a scene of a few pixels."""
+"""Parts of benchmarks/two_trajectory/run.py: what its tables say, and each method on a scene of a few pixels."""
 
 import functools
 import importlib
@@ -10,25 +10,20 @@ import pytest
 
 pytest.importorskip("torch")
 
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
-PARTS = (
-    "fit_cache",
-    "trajectory_scenes",
-    "trajectory_job",
-    "trajectory_rivals",
-    "trajectory_methods",
-    "trajectory_ablation",
-    "trajectory_scores",
-    "trajectory_tables",
-    "trajectory_page",
-    "two_trajectory",
-)
+ROOT = Path(__file__).parents[3]
+PARTS = {
+    "fit_cache": "benchmarks.fit_cache",
+    "two_trajectory": "benchmarks.two_trajectory.run",
+    **{
+        f"trajectory_{name}": f"benchmarks.two_trajectory.{name}"
+        for name in ("scenes", "job", "rivals", "methods", "ablation", "scores", "tables", "page")
+    },
+}
 
 
 @pytest.fixture
-def bench(monkeypatch):
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    return {name: importlib.import_module(name) for name in PARTS}
+def bench():
+    return {name: importlib.import_module(module) for name, module in PARTS.items()}
 
 
 def cell(method, scene, coverage, own, spread=None, photos=None, **values):
@@ -304,7 +299,7 @@ def test_the_ablation_and_equal_seconds_run(bench, stage, tmp_path, monkeypatch)
 
 
 def test_of_factors_that_cost_no_psnr_the_best_disparity_is_taken(bench):
-    sweep = importlib.import_module("trajectory_sweep")
+    sweep = importlib.import_module("benchmarks.two_trajectory.sweep")
     tried = (
         ("tv", "a", 20.0, 0.3),
         ("tv", "b", 19.95, 0.2),
@@ -320,9 +315,9 @@ def test_of_factors_that_cost_no_psnr_the_best_disparity_is_taken(bench):
 
 
 def test_the_factors_are_those_that_the_sweep_chose(bench):
-    stored = json.loads((BENCHMARKS.parent / "docs" / "results" / "two_trajectory_sweep.json").read_text())
+    stored = json.loads((ROOT / "docs" / "results" / "two_trajectory_sweep.json").read_text())
     chosen = {row["table"]: float(row["method"].split()[1]) for row in stored["rows"] if row.get("chosen")}
-    weights, sweep = bench["trajectory_job"].Weights(), importlib.import_module("trajectory_sweep")
+    weights, sweep = bench["trajectory_job"].Weights(), importlib.import_module("benchmarks.two_trajectory.sweep")
     assert chosen == {factor: getattr(weights, factor) for factor in sweep.FACTORS}
 
 
@@ -349,7 +344,7 @@ def test_scenes_are_named_by_what_they_are(bench):
 
 def test_unseen_patches_lie_between_the_cameras(bench):
     from unghost.core.cameras import Cameras
-    from unghost.fields.scenes import look_at
+    from unghost.scenes.generator import look_at
 
     origins = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     cameras = Cameras.create(look_at(origins, np.zeros((2, 3))), np.array([16.0, 16.0, 12.0, 9.0]), 24, 18)

@@ -3,8 +3,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unghost.core import signed_distance as sd
-from unghost.core.sampled_distance import SampledDistance
+from unghost.core.distances import signed as sd
+from unghost.core.distances.sampled import SampledDistance
 
 
 def ball(radius=0.5, nodes=41, reach=0.8):

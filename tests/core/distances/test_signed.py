@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from unghost.core import signed_distance as sd
+from unghost.core.distances import signed as sd
 
 SOLIDS = {  # name: (distance, exact everywhere)
     "half_space": (lambda p: sd.half_space(p, (1, 2, -0.5), 0.3), True),

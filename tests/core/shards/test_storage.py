@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from unghost.core.packing import pack_labels, unpack_labels
-from unghost.core.shards import ARRAYS, OPTIONAL_ARRAYS, read_shard, write_shard
+from unghost.core.shards.packing import pack_labels, unpack_labels
+from unghost.core.shards.storage import ARRAYS, OPTIONAL_ARRAYS, read_shard, write_shard
 
 GOLDEN = {  # of the shard that `arrays` makes below; a change of these bytes is a change of the format
     "inputs": "2bd3ed2069e857c1432cdcf698c7ccc5e6c3f29e9f00e945283313d2349e04ee",

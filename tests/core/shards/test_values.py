@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from unghost.core.frames import CubeFrame, random_rotations
-from unghost.core.packing import (
+from unghost.core.shards.packing import (
     dequantize_signed,
     pack_frame,
     pack_labels,
@@ -17,7 +17,7 @@ from unghost.core.packing import (
     unpack_frame,
     unpack_labels,
 )
-from unghost.core.shards import read_shard, stays_within, write_shard
+from unghost.core.shards.storage import read_shard, stays_within, write_shard
 
 
 def test_labels_by_hand():

@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from unghost.core.cameras import Cameras
-from unghost.core.transmittance import CLEARANCE, TransmittanceMaps
+from unghost.core.visibility.transmittance import CLEARANCE, TransmittanceMaps
 
 AABB = np.array([[-1.0] * 3, [1.0] * 3])
 

@@ -4,8 +4,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from unghost.core.cameras import Cameras
-from unghost.core.cube_views import count_views, frustum_normals, pinholes
 from unghost.core.frames import cube_lattices, random_rotations
+from unghost.core.visibility.view_counts import count_views, frustum_normals, pinholes
 
 
 def random_cameras(rng, count, *, distortion=None):

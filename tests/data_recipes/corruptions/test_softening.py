@@ -3,8 +3,8 @@ import pytest
 
 from unghost.core.frames import unit_lattice
 from unghost.core.occupancy import opacity_from_signed
-from unghost.data_recipes.augment import corrupt, detached_blobs, fog_volumes
-from unghost.data_recipes.soften import _blurring, _regridding, coarse_noise, soften
+from unghost.data_recipes.corruptions.softening import _blurring, _regridding, coarse_noise, soften
+from unghost.data_recipes.corruptions.structured import corrupt, detached_blobs, fog_volumes
 
 SHELL = np.abs(np.linalg.norm(unit_lattice(), axis=-1) - 0.3) < 0.05
 

@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from unghost.core.frames import unit_lattice
-from unghost.data_recipes.augment import CORRUPTIONS, changed_fraction, corrupt, soften
-from unghost.data_recipes.compose import dilate, sample_cube
+from unghost.data_recipes.corruptions.structured import CORRUPTIONS, changed_fraction, corrupt, soften
 from unghost.data_recipes.recipe import Recipe
+from unghost.data_recipes.solids.compose import dilate, sample_cube
 
 RADIUS = np.linalg.norm(unit_lattice(), axis=-1)
 SHELL = np.abs(RADIUS - 0.3) < 0.03

@@ -2,7 +2,7 @@ import numpy as np
 
 from unghost.core.frames import cube_lattices, random_rotations
 from unghost.core.occupancy import opacity_from_signed
-from unghost.data_recipes.harvest_context import signed_opacity, surroundings
+from unghost.data_recipes.harvest.context import signed_opacity, surroundings
 
 AABB = np.array([[-1.0] * 3, [1.0] * 3])
 

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 
 from unghost.core.occupancy import FREE_LABEL, IGNORE_LABEL, SURFACE_LABEL
-from unghost.data_recipes.harvest_labels import Truth, check_fit, severity_of
+from unghost.data_recipes.harvest.labels import Truth, check_fit, severity_of
 
 pytest.importorskip("torch")
-from unghost.fields.scenes import observers
+from unghost.scenes.generator import observers
 
 AABB = np.array([[-1.0] * 3, [1.0] * 3])
 

@@ -9,20 +9,20 @@ import numpy as np
 import pytest
 
 from unghost.core.aabb import contains
-from unghost.core.cube_views import count_views
 from unghost.core.frames import cube_lattices
 from unghost.core.occupancy import FREE_LABEL, IGNORE_LABEL, opacity_from_density
-from unghost.core.packing import dequantize_signed, unpack_frame, unpack_labels
-from unghost.core.shards import read_shard
-from unghost.data_recipes import harvest as module
-from unghost.data_recipes import harvest_config
-from unghost.data_recipes.harvest import harvest, harvest_scene, room_scene
-from unghost.data_recipes.harvest_config import HarvestConfig
-from unghost.data_recipes.harvest_labels import Truth, severity_of
+from unghost.core.shards.packing import dequantize_signed, unpack_frame, unpack_labels
+from unghost.core.shards.storage import read_shard
+from unghost.core.visibility.view_counts import count_views
+from unghost.data_recipes.harvest import config as harvest_config
+from unghost.data_recipes.harvest import run as module
+from unghost.data_recipes.harvest.config import HarvestConfig
+from unghost.data_recipes.harvest.labels import Truth, severity_of
+from unghost.data_recipes.harvest.run import harvest, harvest_scene, room_scene
 
 torch = pytest.importorskip("torch")
-scenes = pytest.importorskip("unghost.fields.scenes")
-solids = pytest.importorskip("unghost.fields.solids")
+scenes = pytest.importorskip("unghost.scenes.generator")
+solids = pytest.importorskip("unghost.scenes.solids")
 
 AABB = np.array([[-1.0] * 3, [1.0] * 3])
 TINY = HarvestConfig(
@@ -212,8 +212,8 @@ def test_room_scenes_repeat_and_fit_a_shard(tmp_path):
 
 KILLED = """
 import sys
-from unghost.data_recipes.harvest import harvest
-from unghost.data_recipes.harvest_config import HarvestConfig
+from unghost.data_recipes.harvest.run import harvest
+from unghost.data_recipes.harvest.config import HarvestConfig
 
 if __name__ == "__main__":
     harvest(sys.argv[1], scenes=8, seed=2, config=HarvestConfig(cubes=12), fit=False)

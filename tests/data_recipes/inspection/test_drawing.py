@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from unghost.data_recipes.render import GHOST, SURFACE, best_turn, png_bytes, render_cube
+from unghost.data_recipes.inspection.drawing import GHOST, SURFACE, best_turn, png_bytes, render_cube
 
 GREY, ORANGE = np.full((32, 32, 32, 3), SURFACE), np.full((32, 32, 32, 3), GHOST)
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from unghost import cli
-from unghost.core.packing import pack_labels, quantize_signed
-from unghost.core.shards import Shard, read_shard, write_shard
-from unghost.data_recipes.curate import curate
-from unghost.data_recipes.preview import draw_pair, find_shards, sources_of, write_preview
-from unghost.data_recipes.preview_page import histogram
+from unghost.core.shards.packing import pack_labels, quantize_signed
+from unghost.core.shards.storage import Shard, read_shard, write_shard
+from unghost.data_recipes.curation import curate
+from unghost.data_recipes.inspection.drawing import MISSING, SURFACE
+from unghost.data_recipes.inspection.page import histogram
+from unghost.data_recipes.inspection.preview import draw_pair, find_shards, sources_of, write_preview
 from unghost.data_recipes.recipe import Recipe
-from unghost.data_recipes.render import MISSING, SURFACE
 
 VOID = {"meta", "img", "br", "link", "input", "rect", "path"}
 

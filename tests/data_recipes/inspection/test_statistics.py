@@ -7,12 +7,10 @@ from hypothesis import strategies as st
 from scipy.stats import wasserstein_distance
 
 from unghost.core.occupancy import signed_from_occupancy
-from unghost.core.packing import pack_labels, quantize_signed
-from unghost.core.shards import write_shard
-from unghost.data_recipes.augment import CORRUPTIONS
-from unghost.data_recipes.compose import sample_cube
-from unghost.data_recipes.recipe import Recipe
-from unghost.data_recipes.statistics import (
+from unghost.core.shards.packing import pack_labels, quantize_signed
+from unghost.core.shards.storage import write_shard
+from unghost.data_recipes.corruptions.structured import CORRUPTIONS
+from unghost.data_recipes.inspection.statistics import (
     AGREEMENT,
     FEATURES,
     cube_features,
@@ -23,6 +21,8 @@ from unghost.data_recipes.statistics import (
     statistics_distance,
     wasserstein,
 )
+from unghost.data_recipes.recipe import Recipe
+from unghost.data_recipes.solids.compose import sample_cube
 
 EMPTY, FULL = np.full((1, 32, 32, 32), -1.0), np.full((1, 32, 32, 32), 1.0)
 

@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from unghost.core.frames import unit_lattice
-from unghost.data_recipes.thickness import half_lattice_distance, local_thickness
+from unghost.data_recipes.inspection.thickness import half_lattice_distance, local_thickness
 
 
 def block(*lengths, start=5, resolution=32):

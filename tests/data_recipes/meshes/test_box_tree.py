@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from unghost.data_recipes.box_tree import BoxTree, morton_codes
+from unghost.data_recipes.meshes.box_tree import BoxTree, morton_codes
 
 
 def soup(seed, count, spread):

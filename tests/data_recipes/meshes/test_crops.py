@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 
 from unghost.core.frames import CubeFrame, random_rotations
-from unghost.data_recipes.crops import choose_frame, cut_cubes, sample_mesh_cubes
-from unghost.data_recipes.mesh_files import load_mesh
-from unghost.data_recipes.meshes import Mesh, select_meshes
+from unghost.data_recipes.meshes.crops import choose_frame, cut_cubes, sample_mesh_cubes
+from unghost.data_recipes.meshes.files import load_mesh
+from unghost.data_recipes.meshes.library import Mesh, select_meshes
+from unghost.data_recipes.meshes.voxels import voxelize_triangles, voxelize_triangles_slowly
 from unghost.data_recipes.recipe import load_recipe
-from unghost.data_recipes.voxelize import voxelize_triangles, voxelize_triangles_slowly
 
 RECIPE = load_recipe("meshes")
-SHARED = Path(__file__).resolve().parents[2].parent / "shared" / "data"
+SHARED = Path(__file__).resolve().parents[3].parent / "shared" / "data"
 SPHERE_RADIUS = 0.5
 
 

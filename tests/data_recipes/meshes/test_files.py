@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from unghost.data_recipes.mesh_files import load_mesh, normalise, read_mesh_file
-from unghost.data_recipes.mesh_reading import MeshEmpty, triangulate
+from unghost.data_recipes.meshes.files import load_mesh, normalise, read_mesh_file
+from unghost.data_recipes.meshes.reading import MeshEmpty, triangulate
 
 trimesh = pytest.importorskip("trimesh")
 
-SHARED = Path(__file__).resolve().parents[2].parent / "shared" / "data"
+SHARED = Path(__file__).resolve().parents[3].parent / "shared" / "data"
 needs_shared = pytest.mark.skipif(not SHARED.exists(), reason="no data folder beside the project")
 
 

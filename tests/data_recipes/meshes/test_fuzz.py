@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from unghost.data_recipes.mesh_files import read_mesh_file
-from unghost.data_recipes.mesh_reading import MeshEmpty, MeshRejected
+from unghost.data_recipes.meshes.files import read_mesh_file
+from unghost.data_recipes.meshes.reading import MeshEmpty, MeshRejected
 
 pytest.importorskip("trimesh")
 

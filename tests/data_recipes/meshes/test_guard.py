@@ -13,14 +13,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from unghost.data_recipes.guard import GuardLimits, MeshGuard, mesh_paths, read_folder
-from unghost.data_recipes.mesh_files import read_mesh_file
-from unghost.data_recipes.repair import RepairOptions, topology
+from unghost.data_recipes.meshes.files import read_mesh_file
+from unghost.data_recipes.meshes.guard import GuardLimits, MeshGuard, mesh_paths, read_folder
+from unghost.data_recipes.meshes.repair import RepairOptions, topology
 
 pytest.importorskip("trimesh")
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="the guard needs POSIX")
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 SHARED = ROOT.parent / "shared" / "data"
 CUBE = "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 1) for z in (0, 1))
 FACES = "f 1 2 4 3\nf 5 7 8 6\nf 1 5 6 2\nf 3 4 8 7\nf 1 3 7 5\nf 2 6 8 4\n"
@@ -199,7 +199,7 @@ def test_the_fence(tmp_path):
     (tmp_path / "inside" / "link").symlink_to(tmp_path / "outside")
     code = (
         "import sys, os, json, socket, urllib.request, subprocess\n"
-        "from unghost.data_recipes.guard_worker import Fence\n"
+        "from unghost.data_recipes.meshes.worker import Fence\n"
         "fence = Fence(); fence.root = os.path.realpath('inside')\n"
         "fence.libraries = tuple(p for p in fence.libraries if p != os.getcwd())\n"
         "sys.addaudithook(fence)\n"

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from unghost.core.frames import CubeFrame
-from unghost.data_recipes.mesh_files import load_mesh
-from unghost.data_recipes.mesh_sources import MeshLibrary
-from unghost.data_recipes.meshes import Mesh, sample_mesh_cube, select_meshes
+from unghost.data_recipes.meshes.files import load_mesh
+from unghost.data_recipes.meshes.library import Mesh, sample_mesh_cube, select_meshes
+from unghost.data_recipes.meshes.sources import MeshLibrary
+from unghost.data_recipes.meshes.voxels import voxelize_triangles
 from unghost.data_recipes.recipe import load_recipe
-from unghost.data_recipes.voxelize import voxelize_triangles
 
 RECIPE = load_recipe("meshes")
-SHARED = Path(__file__).resolve().parents[2].parent / "shared" / "data"
+SHARED = Path(__file__).resolve().parents[3].parent / "shared" / "data"
 needs_shared = pytest.mark.skipif(not SHARED.exists(), reason="no data folder beside the project")
 SQUARE = np.array([[[0, 0, 0], [2, 0, 0], [2, 2, 0]], [[0, 0, 0], [2, 2, 0], [0, 2, 0]]], dtype=float)
 
@@ -127,7 +127,7 @@ def test_missing_trimesh_names_the_extra(tmp_path):
     (tmp_path / "a.ply").write_bytes(b"ply\n")
     code = (
         "import sys; sys.modules['trimesh'] = None\n"
-        "from unghost.data_recipes.mesh_files import load_mesh\n"
+        "from unghost.data_recipes.meshes.files import load_mesh\n"
         f"load_mesh({str(tmp_path / 'a.ply')!r})"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

@@ -4,10 +4,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from unghost.core import signed_distance as sd
-from unghost.data_recipes.harvest import room_scene
-from unghost.data_recipes.harvest_config import HarvestConfig
-from unghost.data_recipes.mesh_objects import SKIN, draw_objects, solid_from_triangles
+from unghost.core.distances import signed as sd
+from unghost.data_recipes.harvest.config import HarvestConfig
+from unghost.data_recipes.harvest.run import room_scene
+from unghost.data_recipes.meshes.objects import SKIN, draw_objects, solid_from_triangles
 
 trimesh = pytest.importorskip("trimesh")
 pytest.importorskip("open3d")

@@ -10,10 +10,10 @@ import zipfile
 import numpy as np
 import pytest
 
-from unghost.data_recipes import mesh_files
-from unghost.data_recipes.mesh_collada import check_xml
-from unghost.data_recipes.mesh_files import normalise, read_mesh_file
-from unghost.data_recipes.mesh_reading import MeshRejected
+from unghost.data_recipes.meshes import files as mesh_files
+from unghost.data_recipes.meshes.collada import check_xml
+from unghost.data_recipes.meshes.files import normalise, read_mesh_file
+from unghost.data_recipes.meshes.reading import MeshRejected
 
 pytest.importorskip("trimesh")
 

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from unghost.core.frames import CubeFrame, random_rotations
-from unghost.data_recipes.mesh_files import read_mesh_file
-from unghost.data_recipes.repair import (
+from unghost.data_recipes.meshes.files import read_mesh_file
+from unghost.data_recipes.meshes.repair import (
     RULES,
     RepairOptions,
     Topology,
@@ -15,9 +15,9 @@ from unghost.data_recipes.repair import (
     topology,
     winding_numbers,
 )
-from unghost.data_recipes.voxelize import voxelize_triangles
+from unghost.data_recipes.meshes.voxels import voxelize_triangles
 
-SHARED = Path(__file__).resolve().parents[2].parent / "shared" / "data"
+SHARED = Path(__file__).resolve().parents[3].parent / "shared" / "data"
 HOSTILE = SHARED / "hostile" / "synthetic"
 
 

@@ -3,8 +3,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from unghost.data_recipes import voxelize as module
-from unghost.data_recipes.voxelize import voxelize_batch, voxelize_triangles, voxelize_triangles_slowly
+from unghost.data_recipes.meshes import voxels as module
+from unghost.data_recipes.meshes.voxels import voxelize_batch, voxelize_triangles, voxelize_triangles_slowly
 
 
 @settings(max_examples=150, deadline=None)

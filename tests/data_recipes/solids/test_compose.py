@@ -5,9 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from unghost.core import signed_distance as sd
+from unghost.core.distances import signed as sd
 from unghost.core.frames import CubeFrame, random_rotations, unit_lattice
-from unghost.data_recipes.compose import (
+from unghost.data_recipes.recipe import Recipe
+from unghost.data_recipes.solids.compose import (
     ComposedObject,
     Part,
     compose_object,
@@ -17,8 +18,7 @@ from unghost.data_recipes.compose import (
     shell_from_distance,
     surface_point,
 )
-from unghost.data_recipes.narrow_band import shell_in_cube
-from unghost.data_recipes.recipe import Recipe
+from unghost.data_recipes.solids.narrow_band import shell_in_cube
 
 RECIPE = Recipe()
 

@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 from unghost.core.frames import CubeFrame
-from unghost.core.packing import pack_frame
-from unghost.data_recipes import csg
-from unghost.data_recipes.crops import cut_cubes
-from unghost.data_recipes.csg import (
+from unghost.core.shards.packing import pack_frame
+from unghost.data_recipes.meshes.crops import cut_cubes
+from unghost.data_recipes.meshes.repair import fill_solid
+from unghost.data_recipes.recipe import load_recipe
+from unghost.data_recipes.solids import csg
+from unghost.data_recipes.solids.csg import (
     ClosedMesh,
     CsgSettings,
     csg_cubes_at,
@@ -18,8 +20,6 @@ from unghost.data_recipes.csg import (
     sample_csg_cubes,
     solid_triangles,
 )
-from unghost.data_recipes.recipe import load_recipe
-from unghost.data_recipes.repair import fill_solid
 
 RECIPE = dataclasses.replace(load_recipe("meshes"), cubes_per_mesh=3, solid_share=0.3)
 manifold3d = pytest.importorskip("manifold3d")
@@ -117,7 +117,7 @@ def test_bad_settings_are_named(settings, message):
 def test_missing_manifold3d_names_the_extra():
     code = (
         "import sys; sys.modules['manifold3d'] = None\n"
-        "import numpy as np\nfrom unghost.data_recipes.csg import random_solid\n"
+        "import numpy as np\nfrom unghost.data_recipes.solids.csg import random_solid\n"
         "random_solid(np.random.default_rng(0))"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

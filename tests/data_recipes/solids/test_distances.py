@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from unghost.data_recipes import distances
+from unghost.data_recipes.solids import distances
 
 HALF_PI = np.pi / 2
 SQUARE = np.array([[0.0, 0], [2, 0], [2, 2], [0, 2]])

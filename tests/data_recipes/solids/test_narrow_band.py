@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 
-from unghost.core import signed_distance as sd
+from unghost.core.distances import signed as sd
 from unghost.core.frames import CubeFrame, random_rotations
-from unghost.data_recipes.compose import compose_object, shell_from_distance, surface_point
-from unghost.data_recipes.narrow_band import shell_in_cube
 from unghost.data_recipes.recipe import Recipe
+from unghost.data_recipes.solids.compose import compose_object, shell_from_distance, surface_point
+from unghost.data_recipes.solids.narrow_band import shell_in_cube
 
 
 def twin(distance, frame, thickness, solid):

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from unghost.data_recipes.draws import log_whole
-from unghost.data_recipes.primitives import BOUNDS, FAMILIES, log_uniform
+from unghost.data_recipes.solids.draws import log_whole
+from unghost.data_recipes.solids.primitives import BOUNDS, FAMILIES, log_uniform
 
 EXACT_OUTSIDE = {"cable", "lathe", "studs"}  # a bound inside
 EXACT = [name for name, family in FAMILIES.items() if family not in BOUNDS]

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from unghost.evaluation.captures import load_cameras, load_capture
-from unghost.evaluation.colmap import find_model, read_model
+from unghost.evaluation.captures.colmap import find_model, read_model
+from unghost.evaluation.captures.loading import load_cameras, load_capture
 
 pycolmap = pytest.importorskip("pycolmap")
 

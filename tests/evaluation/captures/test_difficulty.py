@@ -9,11 +9,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unghost.core.cameras import Cameras
-from unghost.evaluation.birds_eye import draw_birds_eye, ground_plane
-from unghost.evaluation.captures import load_capture
-from unghost.evaluation.difficulty import difficulty, difficulty_rows, difficulty_text, every_nth, normalising_factor
+from unghost.evaluation.captures.birds_eye import draw_birds_eye, ground_plane
+from unghost.evaluation.captures.difficulty import (
+    difficulty,
+    difficulty_rows,
+    difficulty_text,
+    every_nth,
+    normalising_factor,
+)
+from unghost.evaluation.captures.loading import load_capture
 
-SHARED = Path(__file__).parents[2].parent / "shared" / "data" / "captures" / "snowmiku_plush"
+SHARED = Path(__file__).parents[3].parent / "shared" / "data" / "captures" / "snowmiku_plush"
 
 
 def turn(degrees):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from unghost.evaluation.frames import extract_frames, sharpness
+from unghost.evaluation.captures.frames import extract_frames, sharpness
 
 av = pytest.importorskip("av")
 

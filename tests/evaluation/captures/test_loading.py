@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from unghost.evaluation.captures import load_cameras, load_capture
+from unghost.evaluation.captures.loading import load_cameras, load_capture
 
-SHARED = Path(__file__).parents[2].parent / "shared" / "data" / "captures" / "snowmiku_plush"
+SHARED = Path(__file__).parents[3].parent / "shared" / "data" / "captures" / "snowmiku_plush"
 POSES = [
     [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]],
     [[0, -1, 0, 3], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]],

@@ -7,9 +7,9 @@ import pytest
 from PIL import Image
 
 from unghost.core.cameras import Cameras
-from unghost.evaluation.captures import load_capture
-from unghost.evaluation.nerfstudio_folder import write_nerfstudio
-from unghost.evaluation.transforms_file import write_transforms
+from unghost.evaluation.captures.loading import load_capture
+from unghost.evaluation.captures.nerfstudio import write_nerfstudio
+from unghost.evaluation.captures.transforms import write_transforms
 
 NAMES = ("images/frame_00001.png", "images/frame_1_00001.png", "images/frame_00002.png", "images/frame_1_00002.png")
 

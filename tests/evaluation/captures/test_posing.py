@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from unghost.evaluation.captures import load_capture
-from unghost.evaluation.colmap import read_model
-from unghost.evaluation.posing import PosingSettings, pose_jointly
-from unghost.evaluation.transforms_file import read_frames
+from unghost.evaluation.captures.colmap import read_model
+from unghost.evaluation.captures.loading import load_capture
+from unghost.evaluation.captures.posing import PosingSettings, pose_jointly
+from unghost.evaluation.captures.transforms import read_frames
 
 pytest.importorskip("pycolmap")
 
-SHARED = Path(__file__).parents[2].parent / "shared" / "data" / "captures" / "snowmiku_plush"
+SHARED = Path(__file__).parents[3].parent / "shared" / "data" / "captures" / "snowmiku_plush"
 
 
 def _save(folder, prefix, photos):

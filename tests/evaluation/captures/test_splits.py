@@ -3,7 +3,7 @@ import json
 import numpy as np
 import pytest
 
-from unghost.evaluation.splits import by_name, resolve_splits
+from unghost.evaluation.captures.splits import by_name, resolve_splits
 
 
 def _resolve(tmp_path, names, *, meta=None, given=None, dropped=()):

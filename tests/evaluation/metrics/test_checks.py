@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from unghost.evaluation.checks import check_pair, check_range, choose, picked
+from unghost.evaluation.metrics.checks import check_pair, check_range, choose, picked
 
 
 def test_choices_are_listed():

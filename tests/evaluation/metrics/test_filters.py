@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from unghost.evaluation.filters import correlate, gaussian_taps
+from unghost.evaluation.metrics.filters import correlate, gaussian_taps
 
 SCIPY = {"symmetric": "reflect", "reflect": "mirror", "edge": "nearest", "constant": "constant"}
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from unghost.core.cameras import Cameras
-from unghost.evaluation import geometry
+from unghost.evaluation.metrics import geometry
 
 
 def _camera(width=30, height=24, pose=None):

@@ -3,8 +3,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from unghost.evaluation import flip as module
-from unghost.evaluation.flip import flip, flip_map
+from unghost.evaluation.metrics import ldr_flip as module
+from unghost.evaluation.metrics.ldr_flip import flip, flip_map
 
 PPD = module.PIXELS_PER_DEGREE
 

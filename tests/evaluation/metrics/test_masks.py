@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from unghost.evaluation.mask_scores import MASK_KEYS, mask_scores, predicted_mask
+from unghost.evaluation.metrics.masks import MASK_KEYS, mask_scores, predicted_mask
 
 
 def _mask(text):

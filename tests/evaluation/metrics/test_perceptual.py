@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from unghost.evaluation import perceptual
-from unghost.evaluation.perceptual import Lpips, LpipsUnavailable, load_lpips, lpips
+from unghost.evaluation.metrics import perceptual
+from unghost.evaluation.metrics.perceptual import Lpips, LpipsUnavailable, load_lpips, lpips
 
 # A distance that can be worked out by hand in the place of a trained network: squared difference, mean of channels.
 SQUARES = Lpips("squares", lambda first, second: ((first - second) ** 2).mean(axis=-1))

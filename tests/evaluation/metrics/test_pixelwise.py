@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from unghost.core.cameras import Cameras
-from unghost.evaluation import metrics
+from unghost.evaluation.metrics import pixelwise as metrics
 
 FULL = np.ones((24, 30), dtype=bool)
 

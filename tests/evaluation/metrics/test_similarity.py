@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from skimage.metrics import structural_similarity
 
-from unghost.evaluation.similarity import SSIM_CONVENTIONS, ssim
+from unghost.evaluation.metrics.similarity import SSIM_CONVENTIONS, ssim
 
 ROWS, COLUMNS = np.mgrid[0:48, 0:64]
 DISC = (ROWS - 20) ** 2 + (COLUMNS - 30) ** 2 < 17**2

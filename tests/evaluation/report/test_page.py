@@ -5,10 +5,13 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from unghost.evaluation import page, page_charts, page_pictures, page_tables
-from unghost.evaluation.page_charts import Series, line_chart
-from unghost.evaluation.page_pictures import ViewPictures, error_picture, worst_first
-from unghost.evaluation.page_tables import number, score_table
+from unghost.evaluation.report import charts as page_charts
+from unghost.evaluation.report import page
+from unghost.evaluation.report import pictures as page_pictures
+from unghost.evaluation.report import tables as page_tables
+from unghost.evaluation.report.charts import Series, line_chart
+from unghost.evaluation.report.pictures import ViewPictures, error_picture, worst_first
+from unghost.evaluation.report.tables import number, score_table
 
 HOSTILE = '<img src=x onerror="alert(1)">&\'</script><script>alert(2)</script>'
 

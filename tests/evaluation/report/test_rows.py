@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from unghost.evaluation import report
+from unghost.evaluation.report import rows as report
 
 A = {"seed": 0, "psnr": 18.0, "coverage": 0.9, "views_scored": 4, "convention": "paper"}
 B = {"seed": 1, "psnr": 20.0, "coverage": 0.8, "views_scored": 4, "convention": "paper"}

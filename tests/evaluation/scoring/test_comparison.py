@@ -5,11 +5,12 @@ import numpy as np
 import pytest
 
 from unghost.core.cameras import Cameras
-from unghost.evaluation import comparison, metrics
-from unghost.evaluation.comparison import choose_convention, compare_methods, possible_conventions
-from unghost.evaluation.conventions import CONVENTIONS, PLAIN_CONVENTIONS, SceneExtent
-from unghost.evaluation.renders_folder import Method
-from unghost.evaluation.views import Renders, Truth
+from unghost.evaluation.metrics import pixelwise as metrics
+from unghost.evaluation.scoring import comparison
+from unghost.evaluation.scoring.comparison import choose_convention, compare_methods, possible_conventions
+from unghost.evaluation.scoring.conventions import CONVENTIONS, PLAIN_CONVENTIONS, SceneExtent
+from unghost.evaluation.scoring.renders import Method
+from unghost.evaluation.scoring.views import Renders, Truth
 
 SIZE = (16, 20)
 EXTENT = SceneExtent(limit=6.0, unit=1.5)

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from unghost.core.cameras import Cameras
-from unghost.evaluation import conventions
-from unghost.evaluation.checks import choose
-from unghost.evaluation.conventions import CONVENTIONS, PLAIN_CONVENTIONS, SceneExtent, get_convention
-from unghost.evaluation.metrics import PSNR_CONVENTIONS, SSIM_CONVENTIONS
-from unghost.evaluation.perceptual import LPIPS_CONVENTIONS
-from unghost.evaluation.views import Renders, Truth
+from unghost.evaluation.metrics.checks import choose
+from unghost.evaluation.metrics.perceptual import LPIPS_CONVENTIONS
+from unghost.evaluation.metrics.pixelwise import PSNR_CONVENTIONS, SSIM_CONVENTIONS
+from unghost.evaluation.scoring import conventions
+from unghost.evaluation.scoring.conventions import CONVENTIONS, PLAIN_CONVENTIONS, SceneExtent, get_convention
+from unghost.evaluation.scoring.views import Renders, Truth
 
 
 def _cameras(origins):

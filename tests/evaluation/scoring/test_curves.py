@@ -3,8 +3,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from unghost.evaluation import curves
-from unghost.evaluation.curves import Curve
+from unghost.evaluation.scoring import curves
+from unghost.evaluation.scoring.curves import Curve
 
 
 def _rows(pairs, convention="proper", **more):

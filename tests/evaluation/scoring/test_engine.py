@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from unghost.core.cameras import Cameras
-from unghost.evaluation import metrics, scoring
-from unghost.evaluation.conventions import CONVENTIONS, DEPTH_KEYS, NORMAL_KEYS, SceneExtent
-from unghost.evaluation.perceptual import Lpips
-from unghost.evaluation.views import Renders, Truth
+from unghost.evaluation.metrics import pixelwise as metrics
+from unghost.evaluation.metrics.perceptual import Lpips
+from unghost.evaluation.scoring import engine as scoring
+from unghost.evaluation.scoring.conventions import CONVENTIONS, DEPTH_KEYS, NORMAL_KEYS, SceneExtent
+from unghost.evaluation.scoring.views import Renders, Truth
 
 SIZE = (16, 20)
 EXTENT = SceneExtent(limit=6.0, unit=1.5)  # the text's limit is 6, the code's 3

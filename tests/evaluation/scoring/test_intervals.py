@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from unghost.evaluation.intervals import bootstrap_difference, bootstrap_mean, bootstrap_scenes, defined
+from unghost.evaluation.scoring.intervals import bootstrap_difference, bootstrap_mean, bootstrap_scenes, defined
 
 
 def test_equals_a_loop_over_resamples():

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from unghost.evaluation.scoring import SceneScores, score_scene
-from unghost.evaluation.views import Renders, Truth
+from unghost.evaluation.scoring.engine import SceneScores, score_scene
+from unghost.evaluation.scoring.views import Renders, Truth
 
 
 def test_pooled_scores_are_those_of_all_pixels_at_once():

@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from unghost.core.cameras import Cameras
-from unghost.evaluation import metrics, protocol
+from unghost.evaluation.metrics import pixelwise as metrics
+from unghost.evaluation.scoring import protocol
 
 WIDTH, HEIGHT, WALL = 20, 16, 4.0
 

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from unghost.core.cameras import Cameras
-from unghost.evaluation import protocol, pseudo, scoring
-from unghost.evaluation.conventions import SceneExtent
-from unghost.evaluation.pseudo import load_pseudo_truth, make_pseudo_truth
-from unghost.evaluation.views import Renders
+from unghost.evaluation.scoring import engine as scoring
+from unghost.evaluation.scoring import protocol
+from unghost.evaluation.scoring import pseudo_truth as pseudo
+from unghost.evaluation.scoring.conventions import SceneExtent
+from unghost.evaluation.scoring.pseudo_truth import load_pseudo_truth, make_pseudo_truth
+from unghost.evaluation.scoring.views import Renders
 
 WIDTH, HEIGHT, WALL = 20, 16, 4.0
 GOLDEN_POSES = "6619283cbbcffba7e57ac65aa7b57b23802e6e9c08dc0fb6788d3b53a1d1cb5f"

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from unghost.evaluation import renders_folder
-from unghost.evaluation.renders_folder import match_names, read_masks, read_method, read_photos
+from unghost.evaluation.scoring import renders as renders_folder
+from unghost.evaluation.scoring.renders import match_names, read_masks, read_method, read_photos
 
 HEIGHT, WIDTH = 6, 8
 SHAPE = (HEIGHT, WIDTH)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from unghost.core.cameras import Cameras
-from unghost.evaluation.views import Renders, Truth, check_match, view_normals
+from unghost.evaluation.scoring.views import Renders, Truth, check_match, view_normals
 
 COLOURS = np.full((2, 4, 5, 3), 0.5)
 

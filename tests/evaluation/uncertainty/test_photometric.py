@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from unghost.core.cameras import Cameras
-from unghost.regularizer.photo_doubt import photo_doubt, sample_bilinear
+from unghost.evaluation.uncertainty.photometric import photo_doubt, sample_bilinear
 
 SIDE = 24
 

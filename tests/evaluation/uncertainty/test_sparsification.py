@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from unghost.evaluation.sparsification import ause, sparsify
+from unghost.evaluation.uncertainty.sparsification import ause, sparsify
 
 ERRORS = np.array([4.0, 1.0, 3.0, 2.0])
 

@@ -7,16 +7,16 @@ import pytest
 import torch
 
 from unghost.core.manifest import Manifest
-from unghost.export.diffusion_graph import denoiser_model
-from unghost.export.graph import OPERATORS
+from unghost.export.onnx.diffusion_graph import denoiser_model
+from unghost.export.onnx.graph import OPERATORS
+from unghost.export.onnx.to_onnx import export_onnx
+from unghost.export.onnx.unet_graph import UNET_OPERATORS
 from unghost.export.runtime import OnnxDenoiser
-from unghost.export.to_onnx import export_onnx
-from unghost.export.unet_graph import UNET_OPERATORS
 from unghost.prior.checkpoint import load_model, save_model
-from unghost.prior.diffusion_network import DiffusionConfig
-from unghost.prior.network import NetworkConfig
-from unghost.prior.networks import build_network
-from unghost.prior.unet import UNetConfig
+from unghost.prior.diffusion.model import DiffusionConfig
+from unghost.prior.networks.registry import build_network
+from unghost.prior.networks.restoration import NetworkConfig
+from unghost.prior.networks.unet import UNetConfig
 
 COMPACT = NetworkConfig(widths=(8, 16, 24), condition_width=8)
 UNET = UNetConfig(base_width=4, multipliers=(1, 1, 2), heads=2, groups=2)

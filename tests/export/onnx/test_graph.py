@@ -4,7 +4,7 @@ import onnxruntime
 import pytest
 from onnx.helper import make_tensor_value_info
 
-from unghost.export.graph import OPERATORS, OPSET, GraphBuilder
+from unghost.export.onnx.graph import OPERATORS, OPSET, GraphBuilder
 
 
 def test_equal_constants_are_stored_once_and_types_kept_apart():

@@ -3,14 +3,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from unghost.bench import measure_speed
 from unghost.core.channels import CHANNEL_NAMES, LEAST_KNOWN, UNKNOWN, coarse_channel, full_channel
 from unghost.core.manifest import Manifest
-from unghost.export.parity import compare, parity_inputs, verify
+from unghost.export.onnx.parity import compare, parity_inputs, verify
+from unghost.export.onnx.to_onnx import export_onnx
 from unghost.export.runtime import OnnxDenoiser
-from unghost.export.to_onnx import export_onnx
 from unghost.prior.checkpoint import load_model, save_model
-from unghost.prior.network import NetworkConfig
+from unghost.prior.networks.restoration import NetworkConfig
+from unghost.speed import measure_speed
 
 
 def test_inputs_cover_the_extremes():

@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from unghost.core.channels import CHANNEL_NAMES, LEAST_KNOWN
-from unghost.export.graph import OPERATORS, OPSET
-from unghost.export.planar import planar_model
-from unghost.prior.network import SIZES, NetworkConfig
+from unghost.export.onnx.graph import OPERATORS, OPSET
+from unghost.export.onnx.planar import planar_model
+from unghost.prior.networks.restoration import SIZES, NetworkConfig
 
 CONFIGS = {
     "tiny": NetworkConfig(widths=(8, 16, 24), condition_width=8),

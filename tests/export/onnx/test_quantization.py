@@ -7,15 +7,14 @@ import pytest
 import torch
 from onnx import numpy_helper
 
-from unghost.bench import sample_channels
 from unghost.core.frames import unit_lattice
 from unghost.data_recipes.pairs import sample_pair
 from unghost.data_recipes.recipe import load_recipe
 from unghost.denoisers import WEIGHTS, load_denoiser
 from unghost.export.container import PRECISIONS, precision_of
-from unghost.export.graph import OPERATORS
-from unghost.export.parity import TOLERANCES, ParityInputs, verify
-from unghost.export.quantize import (
+from unghost.export.onnx.graph import OPERATORS
+from unghost.export.onnx.parity import TOLERANCES, ParityInputs, verify
+from unghost.export.onnx.quantization import (
     INT8_OPERATORS,
     body_in,
     calibration_inputs,
@@ -26,6 +25,7 @@ from unghost.export.quantize import (
 )
 from unghost.export.runtime import OnnxDenoiser, read_manifest
 from unghost.prior.checkpoint import load_model, save_model
+from unghost.speed import sample_channels
 
 
 @pytest.fixture(scope="module")

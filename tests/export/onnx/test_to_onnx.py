@@ -5,9 +5,9 @@ import pytest
 from onnx import numpy_helper
 
 from unghost.core.manifest import METADATA_KEY, Manifest
-from unghost.export import parity, planar
+from unghost.export.onnx import parity, planar
+from unghost.export.onnx.to_onnx import export_onnx
 from unghost.export.runtime import read_manifest
-from unghost.export.to_onnx import export_onnx
 
 
 def test_manifest_is_carried_over_and_completed(exported):

@@ -7,7 +7,7 @@ import torch
 
 from unghost.core.frames import random_rotations
 from unghost.core.occupancy import opacity_from_density
-from unghost.fields.callables import (
+from unghost.fields.adapters.callables import (
     numpy_density_fn,
     occupancy_density_fn,
     summed_density_fn,

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from unghost.grids import cell_centers, cell_pitch, grid_density_fn
+from unghost.fields.adapters.grids import cell_centers, cell_pitch, grid_density_fn
 
 BOX = np.array([[-1.0, 0.0, 2.0], [1.0, 3.0, 4.0]])
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from unghost.fields import instant_ngp
-from unghost.fields.instant_ngp import CELLS, SHORTEST_STEP, InstantNgpGrid, load_instant_ngp, morton_index
+from unghost.fields.adapters import instant_ngp
+from unghost.fields.adapters.instant_ngp import CELLS, SHORTEST_STEP, InstantNgpGrid, load_instant_ngp, morton_index
 
 
 def pack(value):

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from unghost.fields import msgpack_stream
-from unghost.fields.msgpack_stream import MsgpackError, read_msgpack
+from unghost.fields.adapters import msgpack_stream
+from unghost.fields.adapters.msgpack_stream import MsgpackError, read_msgpack
 
 
 def pack(value):

@@ -7,10 +7,10 @@ import pytest
 import torch
 from torch import nn
 
-from unghost.fields import nerf_pytorch
-from unghost.fields.nerf_pytorch import load_nerf_pytorch, ndc_from_world
+from unghost.fields.adapters import nerf_pytorch
+from unghost.fields.adapters.nerf_pytorch import load_nerf_pytorch, ndc_from_world
 
-SHARED = Path(__file__).resolve().parents[3] / "shared" / "data" / "nerf_checkpoints"
+SHARED = Path(__file__).resolve().parents[4] / "shared" / "data" / "nerf_checkpoints"
 absent = pytest.mark.skipif(not SHARED.is_dir(), reason="the shared data folder is absent")
 
 

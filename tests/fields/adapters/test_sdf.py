@@ -4,7 +4,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unghost.fields.sdf_density import laplace_density, logistic_density, sdf_density_fn
+from unghost.fields.adapters.sdf import laplace_density, logistic_density, sdf_density_fn
 
 
 def test_laplace_by_hand():

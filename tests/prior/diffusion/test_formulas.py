@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from unghost.core.schedule import alphas_cumprod, betas, flip_probabilities
-from unghost.prior.diffusion import (
+from unghost.prior.diffusion.formulas import (
     bernoulli_posterior,
     clean_cubes,
     epsilon_from_x0,

@@ -10,9 +10,9 @@ from torch import nn
 from unghost.core.manifest import Manifest
 from unghost.core.schedule import alphas_cumprod, flip_probabilities
 from unghost.prior.checkpoint import TorchDenoiser, load_model, save_model
-from unghost.prior.diffusion_network import OBJECTIVES, DiffusionConfig, DiffusionNet
-from unghost.prior.network import NetworkConfig, RestorationNet
-from unghost.prior.networks import (
+from unghost.prior.diffusion.model import OBJECTIVES, DiffusionConfig, DiffusionNet
+from unghost.prior.diffusion.noised import NoisedDenoiser
+from unghost.prior.networks.registry import (
     backbone_from_dict,
     build_network,
     config_from_dict,
@@ -20,8 +20,8 @@ from unghost.prior.networks import (
     network_for,
     network_gflop,
 )
-from unghost.prior.noised_denoiser import NoisedDenoiser
-from unghost.prior.unet import UNet, UNetConfig
+from unghost.prior.networks.restoration import NetworkConfig, RestorationNet
+from unghost.prior.networks.unet import UNet, UNetConfig
 
 TINY = NetworkConfig(widths=(8, 8, 8), condition_width=8)
 TINY_UNET = UNetConfig(base_width=4, multipliers=(1, 1, 2), heads=2, groups=2)

@@ -5,15 +5,15 @@ import numpy as np
 import pytest
 import torch
 
-from unghost.prior.batches import Mixture
 from unghost.prior.checkpoint import load_model
-from unghost.prior.config import TrainConfig
-from unghost.prior.diffusion_network import DiffusionNet
-from unghost.prior.diffusion_training import diffusion_losses, training_draws
-from unghost.prior.networks import build_network, network_for
-from unghost.prior.train import train
-from unghost.prior.trainer import Trainer
-from unghost.prior.unet import UNetConfig
+from unghost.prior.diffusion.model import DiffusionNet
+from unghost.prior.diffusion.objective import diffusion_losses, training_draws
+from unghost.prior.networks.registry import build_network, network_for
+from unghost.prior.networks.unet import UNetConfig
+from unghost.prior.training.batches import Mixture
+from unghost.prior.training.config import TrainConfig
+from unghost.prior.training.loop import train
+from unghost.prior.training.run_state import Trainer
 
 TINY_UNET = UNetConfig(base_width=4, multipliers=(1, 1, 2), heads=2, groups=2)
 

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from unghost.core.schedule import alphas_cumprod, flip_log_odds, strided_timesteps
-from unghost.prior.diffusion import kept_share
-from unghost.prior.diffusion_network import DiffusionConfig, DiffusionNet
-from unghost.prior.network import NetworkConfig
-from unghost.prior.sampling import sample_bernoulli, sample_cubes, sample_gaussian
+from unghost.prior.diffusion.formulas import kept_share
+from unghost.prior.diffusion.model import DiffusionConfig, DiffusionNet
+from unghost.prior.diffusion.sampling import sample_bernoulli, sample_cubes, sample_gaussian
+from unghost.prior.networks.restoration import NetworkConfig
 
 ONE = torch.full((1,), 0.1)
 TINY = NetworkConfig(widths=(8, 8, 8), condition_width=8)

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from torch.nn import functional
 
 from unghost.core.channels import CHANNEL_NAMES, LEAST_KNOWN, UNKNOWN
-from unghost.prior.context import context_features, interpolation
-from unghost.prior.network import (
+from unghost.prior.networks.context import context_features, interpolation
+from unghost.prior.networks.restoration import (
     SIZES,
     NetworkConfig,
     RestorationNet,

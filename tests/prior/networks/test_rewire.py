@@ -6,9 +6,9 @@ import torch
 from unghost.core.channels import CHANNEL_NAMES, UNKNOWN
 from unghost.core.manifest import Manifest
 from unghost.prior.checkpoint import save_model
-from unghost.prior.network import NetworkConfig, RestorationNet, space_to_depth, voxel_features
-from unghost.prior.rewire import can_rewire, rewire
-from unghost.prior.trainer import Trainer
+from unghost.prior.networks.restoration import NetworkConfig, RestorationNet, space_to_depth, voxel_features
+from unghost.prior.networks.rewire import can_rewire, rewire
+from unghost.prior.training.run_state import Trainer
 
 SMALL = NetworkConfig(widths=(8, 16, 8), condition_width=8)
 

@@ -4,8 +4,8 @@ import json
 import pytest
 import torch
 
-from unghost.prior.network import parameter_count
-from unghost.prior.unet import UNet, UNetConfig, edge_features, timestep_features, unet_gflop
+from unghost.prior.networks.restoration import parameter_count
+from unghost.prior.networks.unet import UNet, UNetConfig, edge_features, timestep_features, unet_gflop
 
 TINY = UNetConfig(base_width=4, multipliers=(1, 1, 2), heads=2, groups=2)
 

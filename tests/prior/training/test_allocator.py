@@ -6,7 +6,7 @@ import pytest
 SCRIPT = """
 import resource, sys
 import numpy as np
-from unghost.prior.allocator import keep_freed_memory
+from unghost.prior.training.allocator import keep_freed_memory
 kept = keep_freed_memory() if sys.argv[1] == "keep" else None
 def step():
     np.ones(12_000_000, dtype=np.float64)  # 96 MB: more than glibc keeps by itself

@@ -11,9 +11,9 @@ from unghost.core.channels import (
     encode_view_count,
     full_channel,
 )
-from unghost.core.packing import dequantize_signed, unpack_labels
-from unghost.core.shards import read_shard, write_shard
-from unghost.prior.batches import (
+from unghost.core.shards.packing import dequantize_signed, unpack_labels
+from unghost.core.shards.storage import read_shard, write_shard
+from unghost.prior.training.batches import (
     ANY_EDGE,
     BLIND_SEVERITY,
     DEPTH_JITTER,

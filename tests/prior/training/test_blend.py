@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from unghost.core.channels import CHANNEL_NAMES, UNKNOWN
-from unghost.prior.batches import BLIND_SEVERITY, Mixture
-from unghost.prior.blend import Blend, Online, split_batch
+from unghost.prior.training.batches import BLIND_SEVERITY, Mixture
+from unghost.prior.training.blend import Blend, Online, split_batch
 
 
 @dataclass

@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from unghost.prior.config import TrainConfig
+from unghost.prior.training.config import TrainConfig
 
 
 def test_round_trip_through_json():

@@ -15,18 +15,18 @@ import numpy as np
 import pytest
 import torch
 
-from unghost.prior.batches import Batch, Mixture
 from unghost.prior.checkpoint import read_tensors
-from unghost.prior.config import TrainConfig
-from unghost.prior.distributed import TIMEOUT_VARIABLE, Group, RankLost, joined
-from unghost.prior.network import NetworkConfig
-from unghost.prior.train import train
+from unghost.prior.networks.restoration import NetworkConfig
+from unghost.prior.training.batches import Batch, Mixture
+from unghost.prior.training.config import TrainConfig
+from unghost.prior.training.distributed import TIMEOUT_VARIABLE, Group, RankLost, joined
+from unghost.prior.training.loop import train
 
 TOLERANCE = 1e-6  # of a weight, after six steps of AdamW at 1e-3; 4e-8 was seen
 SCRIPT = """
 import json, os, signal, sys
-from unghost.prior.config import TrainConfig
-from unghost.prior.train import train
+from unghost.prior.training.config import TrainConfig
+from unghost.prior.training.loop import train
 import torch
 spec = json.loads(sys.argv[1])
 rank = int(os.environ["RANK"])
@@ -223,7 +223,7 @@ def test_averages_by_hand(tmp_path):
     code = textwrap.dedent(
         """
         import math, os, torch
-        from unghost.prior.distributed import joined
+        from unghost.prior.training.distributed import joined
         with joined("cpu") as group:
             layer = torch.nn.Linear(2, 1)
             layer.weight.grad = torch.full_like(layer.weight, 1.0 + 2.0 * group.rank)

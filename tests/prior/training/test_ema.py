@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from unghost.prior.ema import ExponentialMovingAverage
+from unghost.prior.training.ema import ExponentialMovingAverage
 
 
 def test_by_hand_and_live_weights_untouched():

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from unghost.prior.checkpoint import load_model, read_tensors
-from unghost.prior.train import train
+from unghost.prior.training.loop import train
 
 pytestmark = [
     pytest.mark.skipif(not (hasattr(signal, "SIGKILL") and hasattr(os, "fork")), reason="needs fork and SIGKILL"),
@@ -33,7 +33,7 @@ PROGRAM = """
 import json, os, pathlib, signal, sys
 import torch._dynamo, torch.utils.tensorboard, tqdm  # once, not in every child
 from unghost.prior import checkpoint, ema, train
-from unghost.prior.config import TrainConfig
+from unghost.prior.training.config import TrainConfig
 
 spec = json.loads(sys.argv[1])
 
@@ -108,8 +108,8 @@ def _one_thread():
 
 @pytest.fixture(scope="module")
 def config():
-    from unghost.prior.config import TrainConfig
-    from unghost.prior.network import NetworkConfig
+    from unghost.prior.networks.restoration import NetworkConfig
+    from unghost.prior.training.config import TrainConfig
 
     return TrainConfig(
         network=NetworkConfig(widths=(8, 8, 8), condition_width=8),

@@ -14,13 +14,13 @@ import torch
 from unghost.core.channels import CHANNEL_NAMES
 from unghost.data_recipes.online import OnlinePairs
 from unghost.data_recipes.recipe import load_recipe
-from unghost.prior import train as train_module
-from unghost.prior.batches import Batch, Mixture
-from unghost.prior.blend import Online
 from unghost.prior.checkpoint import load_model, read_tensors
-from unghost.prior.config import TrainConfig
-from unghost.prior.train import train
-from unghost.prior.trainer import TrainingDiverged
+from unghost.prior.training import loop as train_module
+from unghost.prior.training.batches import Batch, Mixture
+from unghost.prior.training.blend import Online
+from unghost.prior.training.config import TrainConfig
+from unghost.prior.training.loop import train
+from unghost.prior.training.run_state import TrainingDiverged
 
 
 class Killed(Exception):
@@ -149,8 +149,8 @@ def test_a_killed_process_leaves_a_state_to_go_on_from(tiny_config, shards, tmp_
     code = textwrap.dedent(
         f"""
         import json, os, signal
-        from unghost.prior.config import TrainConfig
-        from unghost.prior.train import train
+        from unghost.prior.training.config import TrainConfig
+        from unghost.prior.training.loop import train
         def on_step(step, values):
             if step == 2:
                 os.kill(os.getpid(), signal.SIGKILL)

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from unghost.prior.objective import interesting_voxels, restoration_loss
+from unghost.prior.training.objective import interesting_voxels, restoration_loss
 
 
 def empty_case():

@@ -8,10 +8,10 @@ import torch
 
 from unghost.core.channels import CHANNEL_NAMES
 from unghost.core.manifest import Manifest
-from unghost.prior.batches import Batch, Mixture
 from unghost.prior.checkpoint import save_model
-from unghost.prior.network import NetworkConfig, RestorationNet
-from unghost.prior.trainer import Trainer, TrainingDiverged, use_bf16
+from unghost.prior.networks.restoration import NetworkConfig, RestorationNet
+from unghost.prior.training.batches import Batch, Mixture
+from unghost.prior.training.run_state import Trainer, TrainingDiverged, use_bf16
 
 
 @pytest.fixture

@@ -5,10 +5,10 @@ from hypothesis import strategies as st
 
 from unghost.core.channels import CHANNEL_NAMES, UNKNOWN
 from unghost.core.manifest import Manifest
-from unghost.core.packing import dequantize_signed, pack_labels, quantize_signed
-from unghost.core.shards import read_shard, write_shard
-from unghost.prior.batches import stored_channels
-from unghost.prior.evaluate import KeepCurve, evaluate, masked_iou
+from unghost.core.shards.packing import dequantize_signed, pack_labels, quantize_signed
+from unghost.core.shards.storage import read_shard, write_shard
+from unghost.prior.training.batches import stored_channels
+from unghost.prior.training.validation import KeepCurve, evaluate, masked_iou
 
 
 class Rule:

@@ -8,10 +8,10 @@ from torch import nn
 from unghost.core.channels import CHANNEL_NAMES
 from unghost.denoisers import WEIGHTS
 from unghost.prior.checkpoint import load_model, read_tensors
-from unghost.prior.network import NetworkConfig, RestorationNet
-from unghost.prior.train import train
-from unghost.prior.trainer import Trainer, TrainingDiverged
-from unghost.prior.watch import DEAD, EXPLODED, SETTLED_STEPS, LossWatch, complaint, input_dependence
+from unghost.prior.networks.restoration import NetworkConfig, RestorationNet
+from unghost.prior.training.loop import train
+from unghost.prior.training.run_state import Trainer, TrainingDiverged
+from unghost.prior.training.watch import DEAD, EXPLODED, SETTLED_STEPS, LossWatch, complaint, input_dependence
 
 TINY = NetworkConfig(widths=(8, 8, 8), condition_width=8)
 

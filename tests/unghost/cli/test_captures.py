@@ -1,28 +1,24 @@
 """The verbs capture and convert: from two videos of a rendered room to a folder that is read again."""
 
-import importlib.util
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
+from unghost_tests import textured_room
 
 from unghost import cli
 from unghost.core.cameras import Cameras
-from unghost.evaluation.captures import load_capture
-from unghost.evaluation.transforms_file import write_transforms
+from unghost.evaluation.captures.loading import load_capture
+from unghost.evaluation.captures.transforms import write_transforms
 
-SHARED = Path(__file__).parents[2].parent / "shared" / "data" / "captures" / "snowmiku_plush"
-HELPER = Path(__file__).parents[1] / "evaluation" / "textured_room.py"
+SHARED = Path(__file__).parents[3].parent / "shared" / "data" / "captures" / "snowmiku_plush"
 
 
 @pytest.fixture(scope="module")
 def room():
-    spec = importlib.util.spec_from_file_location("textured_room", HELPER)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return textured_room
 
 
 def run(*words):

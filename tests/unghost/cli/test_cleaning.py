@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from unghost import cli
-from unghost.grids import load_grid, save_grid
-from unghost.regularizer.keep_mask import KeepMask
+from unghost.cleaning.keep_mask import KeepMask
+from unghost.fields.adapters.grids import load_grid, save_grid
 
 BOX = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
 SIDE = 2 / 32

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from unghost import cli
-from unghost.evaluation import metrics
+from unghost.evaluation.metrics import pixelwise as metrics
 
 WIDTH, HEIGHT, FOCAL, WALL = 32, 24, 32.0, 4.0
 XS = {"t0": 0.0, "e0": 2.0, "e1": 1.0, "e2": 0.5, "t1": -10.0}  # the last sees nothing of what they see
@@ -223,7 +223,7 @@ def test_options_of_masks_npz_are_refused_without_it(renders, capture, masks, ca
 
 
 def test_lpips_that_cannot_be_had_leaves_the_other_columns(renders, capture, capsys, monkeypatch):
-    from unghost.evaluation import perceptual
+    from unghost.evaluation.metrics import perceptual
 
     monkeypatch.setattr(perceptual.importlib.util, "find_spec", lambda name: None)
     words = [renders / "a", "--gt", capture, "--out", renders / "out", "--lpips", "vgg"]

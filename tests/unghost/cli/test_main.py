@@ -3,11 +3,12 @@ import json
 import numpy as np
 import pytest
 
-from unghost import cli, commands
-from unghost.commands_prior import expand_shards
-from unghost.core.packing import pack_labels
-from unghost.core.shards import write_shard
-from unghost.grids import load_grid, save_grid
+from unghost import cli
+from unghost.cli import prior as commands
+from unghost.cli.training import expand_shards
+from unghost.core.shards.packing import pack_labels
+from unghost.core.shards.storage import write_shard
+from unghost.fields.adapters.grids import load_grid, save_grid
 
 VERBS = (
     "demo",
@@ -144,8 +145,8 @@ def test_grid_files_round_trip_and_refuse(tmp_path):
 
 
 def test_clean_hands_the_cameras_of_a_transforms_file_on(tmp_path, monkeypatch, capsys):
-    from unghost import cleaning
-    from unghost.regularizer.keep_mask import KeepMask
+    from unghost import facade as cleaning
+    from unghost.cleaning.keep_mask import KeepMask
 
     pose = [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
     frames = [{"file_path": f"{name}.png", "transform_matrix": pose} for name in "ab"]

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from unghost import cli
-from unghost.evaluation.pseudo import load_pseudo_truth
+from unghost.evaluation.scoring.pseudo_truth import load_pseudo_truth
 
 WIDTH, HEIGHT, FOCAL = 32, 24, 32.0
 WALL = 4.0  # in front of both cameras

@@ -1,7 +1,7 @@
 import pytest
 
-from unghost import commands_recipes
-from unghost.data_recipes import harvest as module
+from unghost.cli import recipes as commands_recipes
+from unghost.data_recipes.harvest import run as module
 
 
 @pytest.fixture

@@ -7,8 +7,8 @@ import pytest
 import torch
 from PIL import Image
 
-from unghost.regularizer.keep_mask import KeepMask
-from unghost.removal_preview import GAP, SIDE, occupied_cells, preview_png
+from unghost.cleaning.keep_mask import KeepMask
+from unghost.cli.removal_preview import GAP, SIDE, occupied_cells, preview_png
 
 SHAPE = (6, 8, 10)  # x, y, z
 

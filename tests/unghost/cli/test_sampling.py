@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from unghost import cli
-from unghost.commands_sample import draw_cube, sheet
+from unghost.cli.sampling import draw_cube, sheet
 from unghost.core.manifest import Manifest
 from unghost.prior.checkpoint import save_model
-from unghost.prior.diffusion_network import DiffusionConfig, DiffusionNet
-from unghost.prior.network import NetworkConfig, RestorationNet
-from unghost.prior.sampling import sample_cubes
+from unghost.prior.diffusion.model import DiffusionConfig, DiffusionNet
+from unghost.prior.diffusion.sampling import sample_cubes
+from unghost.prior.networks.restoration import NetworkConfig, RestorationNet
 
 TINY = NetworkConfig(widths=(8, 8, 8), condition_width=8)
 

@@ -5,8 +5,8 @@ import pytest
 
 from unghost import cli
 from unghost.core.channels import CHANNEL_NAMES
-from unghost.core.packing import pack_labels
-from unghost.core.shards import write_shard
+from unghost.core.shards.packing import pack_labels
+from unghost.core.shards.storage import write_shard
 
 torch = pytest.importorskip("torch")
 

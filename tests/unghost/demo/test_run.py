@@ -5,12 +5,13 @@ import re
 import numpy as np
 import pytest
 
-from unghost import demo, demo_pictures
 from unghost.core.manifest import Manifest
-from unghost.demo_ghosts import COUNTS, KINDS
-from unghost.demo_render import PAPER, Volume, look_at, render
-from unghost.demo_room import AABB, FAR, SHAPE, build_room
+from unghost.demo import pictures as demo_pictures
+from unghost.demo import run as demo
 from unghost.denoisers import WEIGHTS
+from unghost.scenes.labelled_room.ghosts import COUNTS, KINDS
+from unghost.scenes.labelled_room.room import AABB, FAR, SHAPE, build_room
+from unghost.scenes.volume_renderer import PAPER, Volume, look_at, render
 
 
 class Threshold:

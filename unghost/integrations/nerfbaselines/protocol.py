@@ -20,11 +20,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .conventions import DEPTH_KEYS, NORMAL_KEYS, SceneExtent, get_convention
-from .pseudo import PseudoTruth, load_pseudo_truth
-from .renders_folder import match_names
-from .scoring import score_scene
-from .views import Renders, Truth
+from ...evaluation.scoring.conventions import DEPTH_KEYS, NORMAL_KEYS, SceneExtent, get_convention
+from ...evaluation.scoring.engine import score_scene
+from ...evaluation.scoring.pseudo_truth import PseudoTruth, load_pseudo_truth
+from ...evaluation.scoring.renders import match_names
+from ...evaluation.scoring.views import Renders, Truth
 
 MASKS_VARIABLE = "UNGHOST_MASKS"
 NOT_TO_BE_HAD = ("lpips",)  # nerfbaselines has its own network and no way to ask for its map

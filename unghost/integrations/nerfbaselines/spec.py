@@ -7,4 +7,4 @@ from nerfbaselines import register
 
 for _name in ("WholeImage", "VisibleOnly", "Proper", "PaperText", "PaperCode"):
     _id = "unghost" + "".join("-" + each.lower() if each.isupper() else each for each in _name)
-    register({"id": _id, "evaluation_protocol_class": f"unghost.evaluation.nerfbaselines_protocol:{_name}"})
+    register({"id": _id, "evaluation_protocol_class": f"unghost.integrations.nerfbaselines.protocol:{_name}"})

@@ -3,8 +3,9 @@
 Its training is nerfacto's, but for pose optimisation, which is off: a prior on geometry and moving cameras pull at
 each other, and scores need the poses as they are.
 
-Written against nerfstudio 1.1.5's sources; what has been run is the model (``benchmarks/nerfstudio_client.py``): the
-trainer imports more (torchvision, gsplat, …) than the machines that test this project can have.
+Written against nerfstudio 1.1.5's sources; what has been run is the model
+(``benchmarks/integrations/nerfstudio.py``): the trainer imports more (torchvision, gsplat, …) than the machines that
+test this project can have.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.plugins.types import MethodSpecification
 
-from .nerfstudio_model import UnghostNerfactoModelConfig
+from .model import UnghostNerfactoModelConfig
 
 RAYS = 4096
 

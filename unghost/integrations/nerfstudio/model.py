@@ -1,7 +1,7 @@
 """nerfacto with the regularizer on: all that differs from nerfstudio's own model is two more losses.
 
 Imports nerfstudio 1.1.5 and torch; the regularizer and the denoiser wait for the first training step.
-``unghost/nerfstudio_method.py`` makes a method of it: ``ns-train unghost-nerfacto``.
+``unghost/integrations/nerfstudio/method.py`` makes a method of it: ``ns-train unghost-nerfacto``.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from nerfstudio.models.nerfacto import NerfactoModel, NerfactoModelConfig
 
-from .core.cameras import Cameras
+from ...core.cameras import Cameras
 
 
 @dataclass
@@ -91,8 +91,8 @@ class UnghostNerfactoModel(NerfactoModel):  # type: ignore[misc]
 
     def regularize(self, cameras: Any) -> None:
         """Regularize from now on, knowing these cameras (nerfstudio's, of the training photos)."""
-        from .denoisers import load_denoiser
-        from .regularizer.regularizer import DensityRegularizer
+        from ...denoisers import load_denoiser
+        from ...regularizer.density_regularizer import DensityRegularizer
 
         c = self.config
         name = c.unghost_denoiser

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from unghost.core.cameras import Cameras
-from unghost.evaluation import metrics, nerfbaselines_protocol
-from unghost.evaluation.nerfbaselines_protocol import MASKS_VARIABLE, PROTOCOLS, Proper, VisibleOnly, WholeImage
-from unghost.evaluation.pseudo import make_pseudo_truth
-from unghost.evaluation.scoring import score_scene
-from unghost.evaluation.views import Renders
+from unghost.evaluation.metrics import pixelwise as metrics
+from unghost.evaluation.scoring.engine import score_scene
+from unghost.evaluation.scoring.pseudo_truth import make_pseudo_truth
+from unghost.evaluation.scoring.views import Renders
+from unghost.integrations.nerfbaselines import protocol as nerfbaselines_protocol
+from unghost.integrations.nerfbaselines.protocol import MASKS_VARIABLE, PROTOCOLS, Proper, VisibleOnly, WholeImage
 
 SIZE = (14, 20)
 NAME = "frames/7.png"
@@ -146,7 +147,7 @@ def test_every_protocol_has_a_name_and_is_registered():
         "unghost-paper-text",
         "unghost-paper-code",
     ]
-    spec = Path(nerfbaselines_protocol.__file__).with_name("nerfbaselines_spec.py").read_text(encoding="utf-8")
+    spec = Path(nerfbaselines_protocol.__file__).with_name("spec.py").read_text(encoding="utf-8")
     registered = re.findall(r'"(\w+)"', re.search(r"in \((.*?)\):", spec).group(1))
     assert registered == [each.__name__ for each in PROTOCOLS]
     ids = ["unghost" + re.sub("([A-Z])", lambda m: "-" + m.group(1).lower(), each) for each in registered]
@@ -154,5 +155,5 @@ def test_every_protocol_has_a_name_and_is_registered():
 
 
 def test_nothing_of_nerfbaselines_is_imported():
-    program = "import sys; sys.modules['nerfbaselines'] = None; import unghost.evaluation.nerfbaselines_protocol"
+    program = "import sys; sys.modules['nerfbaselines'] = None; import unghost.integrations.nerfbaselines.protocol"
     subprocess.run([sys.executable, "-c", program], check=True, timeout=60)

@@ -22,17 +22,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     import tyro
 
-    from . import (
-        commands,
-        commands_capture,
-        commands_clean,
-        commands_doubt,
-        commands_evaluate,
-        commands_masks,
-        commands_prior,
-        commands_recipes,
-        commands_sample,
-    )
+    from . import captures as commands_capture
+    from . import cleaning as commands_clean
+    from . import evaluation as commands_evaluate
+    from . import masks as commands_masks
+    from . import prior as commands
+    from . import recipes as commands_recipes
+    from . import sampling as commands_sample
+    from . import training as commands_prior
+    from . import uncertainty as commands_doubt
 
     verbs: dict[str, Callable[..., Any]] = {
         "demo": commands.demo,
@@ -59,7 +57,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             verbs, prog="unghost", args=words, description="Take ghosts out of radiance fields."
         )
     except USER_ERRORS as error:
-        if isinstance(error, ImportError) and (error.name or "").startswith(__package__):
+        if isinstance(error, ImportError) and (error.name or "").startswith("unghost"):
             raise  # a part of ours is missing: not the user's doing
         message = " ".join(str(error).split()) or type(error).__name__
         print(f"unghost {verb}: {message}", file=sys.stderr)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from unghost.core.frames import unit_lattice
-from unghost.core.packing import pack_labels, quantize_signed
-from unghost.core.shards import write_shard
-from unghost.prior.config import TrainConfig
-from unghost.prior.network import NetworkConfig
+from unghost.core.shards.packing import pack_labels, quantize_signed
+from unghost.core.shards.storage import write_shard
+from unghost.prior.networks.restoration import NetworkConfig
+from unghost.prior.training.config import TrainConfig
 
 TINY = NetworkConfig(widths=(8, 8, 8), condition_width=8)
 

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from unghost.core.cameras import Cameras
-from unghost.fields.scenes import look_at
-from unghost.fields.solids import Light, Solid, SolidScene, Texture
+from unghost.scenes.generator import look_at
+from unghost.scenes.solids import Light, Solid, SolidScene, Texture
 
 
 @pytest.fixture(scope="session")

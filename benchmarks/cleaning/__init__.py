@@ -1,0 +1,1 @@
+"""Cost and effect of ``clean``, on fields and on splats."""

@@ -1,0 +1,1 @@
+"""Making cubes: speed, corruptions, and the harvest."""

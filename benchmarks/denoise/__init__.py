@@ -1,0 +1,1 @@
+"""The reference measurement of priors: cubes that nobody trained on."""

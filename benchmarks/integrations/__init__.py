@@ -1,0 +1,1 @@
+"""Other programs with unghost plugged in."""

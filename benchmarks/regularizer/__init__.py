@@ -1,0 +1,1 @@
+"""Cost and effect of the regularizer, and its numerical stability."""

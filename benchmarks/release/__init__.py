@@ -1,0 +1,1 @@
+"""What a release needs: shipped models, model cards, the README's tables."""

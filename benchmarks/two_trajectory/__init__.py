@@ -1,0 +1,1 @@
+"""Trained on one sweep of photos, scored on another."""

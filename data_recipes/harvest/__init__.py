@@ -1,0 +1,24 @@
+"""Training pairs harvested from badly constrained fields of synthetic scenes."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ...core.lazy import attach
+
+if TYPE_CHECKING:
+    from .config import HarvestConfig as HarvestConfig
+    from .labels import Truth as Truth
+    from .run import harvest as harvest
+    from .run import harvest_cubes as harvest_cubes
+    from .run import harvest_scene as harvest_scene
+    from .run import room_scene as room_scene
+
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    {
+        ".config": ["HarvestConfig"],
+        ".labels": ["Truth"],
+        ".run": ["harvest", "harvest_cubes", "harvest_scene", "room_scene"],
+    },
+)

@@ -1,0 +1,18 @@
+"""nerfacto with the regularizer, as a nerfstudio method."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ...core.lazy import attach
+
+if TYPE_CHECKING:
+    from .model import UnghostNerfactoModelConfig as UnghostNerfactoModelConfig
+    from .model import cameras_of as cameras_of
+
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    {
+        ".model": ["UnghostNerfactoModelConfig", "cameras_of"],
+    },
+)
