@@ -206,7 +206,7 @@ def main() -> None:
         field.aabb,
         field_pitch=pitch,
         strength=args.strength,
-        backend="torch",
+        settings=CleanSettings(backend="torch"),
     )
 
     solid, views = widen(occupied, 1), 1 if field.ndc else 6
