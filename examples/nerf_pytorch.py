@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from unghost import KeepMask, clean
+from unghost import CleanSettings, KeepMask, clean
 from unghost.core.cameras import Cameras
 from unghost.core.occupancy import DEFAULT_OPACITY_THRESHOLD, opacity_from_density
 from unghost.fields.adapters.grids import cell_centers
