@@ -19,6 +19,8 @@ class HarvestConfig:
             ``mlp`` is left out by default: it is there to be harvested for evaluation.
         resolutions: cells along an axis of the contracted cube (of the finest level, of half the shortest wavelength).
         photos, photo_width: how many photos a field sees, and their width in pixels (4:3).
+        observer_photos, observer_width: views of a second sweep and their width in pixels (4:3); only their depth is
+            traced, for the labels: what no photo of either sweep sees is not judged.
         steps: fitting steps, log-uniform; cubes are also taken after ``EARLY`` of them.
         rays: rays a step.
         objects: how many meshes stand in a scene, where there is a folder of them.
@@ -35,6 +37,8 @@ class HarvestConfig:
     resolutions: tuple[int, ...] = (64, 80, 96, 112, 128, 160)
     photos: tuple[int, int] = (12, 32)
     photo_width: tuple[int, int] = (80, 128)
+    observer_photos: int = 16
+    observer_width: int = 64
     steps: tuple[int, int] = (250, 900)
     rays: int = 1152
     objects: tuple[int, int] = (0, 5)
@@ -61,3 +65,8 @@ class HarvestConfig:
             raise ValueError(f"HarvestConfig: objects must be (low, high) with 0 <= low <= high, got {self.objects}")
         if min(self.rays, self.cubes) < 1:
             raise ValueError(f"HarvestConfig: rays and cubes must be >= 1, got {self.rays} and {self.cubes}")
+        if self.observer_photos < 0 or self.observer_width < 4:
+            raise ValueError(
+                "HarvestConfig: observer_photos must be >= 0 and observer_width >= 4, got "
+                f"{self.observer_photos} and {self.observer_width}"
+            )

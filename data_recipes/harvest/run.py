@@ -176,7 +176,13 @@ def harvest_scene(
         distortion_weight=float(rng.choice([0.0, 0.002, 0.01])),
         sampling=Sampling(near_samples=samples, far_samples=max(12, samples // 4)),
     )
-    others = observers(np.random.default_rng([seed, index, OBSERVER_STREAM]), photographed.scene)
+    others = observers(
+        np.random.default_rng([seed, index, OBSERVER_STREAM]),
+        photographed.scene,
+        count=config.observer_photos,
+        width=config.observer_width,
+        height=config.observer_width * 3 // 4,
+    )
     truth = Truth(photographed, field.aabb, observers=others)
     parts: list[dict[str, NDArray[Any]]] = []
 

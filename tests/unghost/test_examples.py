@@ -34,9 +34,24 @@ def run(name, *arguments, folder):
     return done.stdout
 
 
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """Runs each example once: what it printed, and the folder that it ran in."""
+    done = {}
+
+    def once(name):
+        if name not in done:
+            folder = tmp_path_factory.mktemp(name)
+            done[name] = run(name, folder=folder), folder
+        return done[name]
+
+    return once
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
-def test_runs(path, tmp_path):
-    printed = run(path.stem, folder=tmp_path)
+def test_runs(path, runs):
+    printed, _ = runs(path.stem)
     if path.stem == "two_lines":
         left, kept = (float(share) for share in re.findall(r"([\d.]+)%", printed.splitlines()[-1]))
         assert left < 5
@@ -47,11 +62,12 @@ def test_runs(path, tmp_path):
         assert kept >= AT_LEAST[path.stem][1]
 
 
-def test_the_cleaned_splats_open_elsewhere(tmp_path):
+@pytest.mark.slow
+def test_the_cleaned_splats_open_elsewhere(runs):
     from plyfile import PlyData
 
-    run("splats", folder=tmp_path)
-    before, after = (PlyData.read(str(tmp_path / f"made_here{end}.ply"))["vertex"].data for end in ("", "_clean"))
+    _, folder = runs("splats")
+    before, after = (PlyData.read(str(folder / f"made_here{end}.ply"))["vertex"].data for end in ("", "_clean"))
     assert after.dtype.names == (*before.dtype.names, "keep_score")
     assert 0.8 * len(before) < len(after) < len(before)
 
@@ -89,6 +105,7 @@ def scores(printed):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("no_ndc", [True, False])
 def test_a_nerf_made_by_hand(tmp_path, no_ndc):
     path = half_space(tmp_path, no_ndc=no_ndc)

@@ -29,6 +29,8 @@ TINY = HarvestConfig(
     resolutions=(24, 32),
     photos=(2, 3),
     photo_width=(16, 20),
+    observer_photos=4,
+    observer_width=32,
     steps=(10, 14),
     rays=48,
     cubes=3,
@@ -266,6 +268,7 @@ def test_bad_counts_are_refused_before_anything_is_written(tmp_path, arguments):
         ({"kinds": (), "shares": ()}, "kinds must be different ones"),
         ({"kinds": ("mlp",)}, r"shares must be one finite number > 0 for each of \('mlp',\), got \(0.6, 0.4\)"),
         ({"shares": (1.0, 0.0)}, "shares must be one finite number > 0"),
+        ({"observer_width": 3}, "observer_photos must be >= 0 and observer_width >= 4, got 16 and 3"),
         ({"cubes": 0}, "rays and cubes must be >= 1, got 1152 and 0"),
     ],
 )
