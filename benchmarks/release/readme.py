@@ -307,7 +307,7 @@ def two_trajectory(results: dict[str, Any]) -> list[str]:
     equal = ("psnr_at_coverage", "psnr_area", "psnr_area_by_photos", "disparity_mae_area")
     own = ("psnr", "coverage", "free_space_error", "cpu_seconds")
     digits = dict(zip((*equal, *own), (2, 2, 2, 3, 2, 3, 4, 0)))
-    lines = [[row["method"], *(number(row[key], digits[key]) for key in (*equal, *own))] for row in rows]
+    lines = [[row["method"], *(number(row.get(key), digits[key]) for key in (*equal, *own))] for row in rows]
     head = (
         "method",
         "PSNR, equal coverage",
