@@ -10,6 +10,7 @@ from .core.manifest import Denoiser
 
 WEIGHTS = Path(__file__).resolve().parent / "weights"
 SUFFIXES = {"onnx": ".onnx", "torch": ".safetensors"}
+SUCCESSORS = {"m": "default"}  # names that were shipped once -> what replaces them
 
 
 def _load_onnx(path: Path, threads: int | None) -> Denoiser:
@@ -44,8 +45,8 @@ def load_denoiser(
     """Load the shipped denoiser, or one of your own.
 
     Args:
-        name_or_path: a shipped name (``"default"``; ``"views"``, which takes view counts too; ``"m"``, an
-            older and larger one; ``"xs"``, a smaller one), or the path of an ``.onnx`` or ``.safetensors`` file.
+        name_or_path: a shipped name (``"default"``; ``"views"``, which takes view counts too; ``"xs"``, a
+            smaller one), or the path of an ``.onnx`` or ``.safetensors`` file.
         backend: ``"onnx"`` (numpy arrays in and out; no torch) or ``"torch"`` (tensors). None takes what
             the file's ending says, and ``"onnx"`` for a shipped name.
         threads: of onnxruntime; None leaves the choice to it.
@@ -77,8 +78,11 @@ def load_denoiser(
         backend = backend or "onnx"
         path = WEIGHTS / f"{name_or_path}{SUFFIXES[backend]}"
     if not path.is_file():
+        successor = SUCCESSORS.get(str(name_or_path))
+        retired = f" (no longer shipped: {successor!r} replaces it)" if successor else ""
         raise FileNotFoundError(
-            f"load_denoiser: no file {path.name if path.parent == WEIGHTS else path} for {str(name_or_path)!r}; "
-            f"shipped names: {', '.join(shipped_names()) or 'none'}, or give the path of an .onnx or .safetensors file"
+            f"load_denoiser: no file {path.name if path.parent == WEIGHTS else path} for {str(name_or_path)!r}"
+            f"{retired}; shipped names: {', '.join(shipped_names()) or 'none'}, or give the path of an .onnx or "
+            ".safetensors file"
         )
     return _LOADERS[backend](path, threads)

@@ -2,7 +2,7 @@
 
     python -m benchmarks.data.harvest_page out/harvest --seconds S --scenes N
 
-Writes docs/harvest.md and docs/harvest/pairs.png, and docs/harvest/sample: a shard of some fifty cubes of scenes
+Writes docs/harvest.md and docs/harvest/pairs.png, and docs/harvest/sample: a shard of a few cubes of scenes
 without meshes (so that all of it is generated), for a look and for tests. Run benchmarks/data/harvest_statistics.py
 first.
 """
@@ -13,6 +13,7 @@ import json
 import shutil
 from collections import Counter
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from unghost.data_recipes.inspection.drawing import GHOST, SURFACE, UNJUDGED
 from unghost.data_recipes.inspection.preview import draw_pair, find_shards
 
 ROOT = Path(__file__).resolve().parents[2]
-SAMPLE_CUBES = 60  # 82 kB each
+SAMPLE_CUBES = 8  # 82 kB each
 SHOWN, WIDTH, GAP = 6, 192, 8
 HEADINGS = ("what the field shows", "the truth", "a slice: opacity", "labels", "surroundings", "views (white: 24+)")
 MOST_VIEWS = 24
@@ -79,11 +80,18 @@ def interesting(shard: Shard) -> NDArray[np.int64]:
     return np.argsort(-np.minimum(*counts), kind="stable")
 
 
+def alternating(shards: list[Shard]) -> list[Shard]:
+    """Shards in turn from every kind of field, each kind in its own order."""
+    kinds: dict[str, list[Shard]] = {}
+    for shard in shards:
+        kinds.setdefault(shard.provenance["field"], []).append(shard)
+    return [shard for turn in zip_longest(*kinds.values()) for shard in turn if shard is not None]
+
+
 def write_sample(shards: list[Shard], target: Path) -> int:
-    """Cubes evenly from some scenes; returns how many bytes they take."""
-    chosen = [shards[i] for i in np.unique(np.linspace(0, len(shards) - 1, 12).round().astype(int))]
-    each = SAMPLE_CUBES // len(chosen)
-    rows = [np.linspace(0, len(shard) - 1, each).round().astype(int) for shard in chosen]
+    """Write the best mixture of surface and ghosts of some scenes; returns how many bytes the cubes take."""
+    chosen = sorted(alternating(shards)[:SAMPLE_CUBES], key=lambda shard: int(shard.provenance["scene"]))
+    rows = [interesting(shard)[:1] for shard in chosen]
     names = (*ARRAYS, "surroundings", "view_count", "transmittance", "frames")
     arrays = {name: np.concatenate([getattr(s, name)[r] for s, r in zip(chosen, rows)]) for name in names}
     if target.exists():

@@ -23,13 +23,14 @@ from unghost import load_denoiser
 from unghost.cli.training import expand_shards
 from unghost.core.channels import CHANNEL_NAMES, SIGNED_OPACITY, SURROUNDINGS, TRANSMITTANCE, VIEW_COUNT
 from unghost.core.occupancy import DEFAULT_OPACITY_THRESHOLD, opacity_from_signed, signed_from_occupancy
-from unghost.core.results import build_results, write_results
+from unghost.core.results import build_results
 from unghost.core.shards.packing import dequantize_signed, quantize_signed
 from unghost.core.shards.storage import Shard, read_shard, write_shard
 from unghost.prior.networks.restoration import SIZES
 from unghost.prior.training.config import TrainConfig
 from unghost.prior.training.loop import train
 
+from ..compact import rounded, write_lines
 from ..fit_cache import say
 from .run import Options as Measurement
 from .run import all_sets, mean_over_severities, row_of
@@ -191,10 +192,10 @@ def main() -> None:
             if row["method"] == variant and row["set"] in FOG
         ]
         say(f"{variant:46s} {'  '.join(fog)}")
-        write_results(
+        write_lines(
             options.out / "channels.json",
             build_results(
-                rows,
+                rounded(rows),
                 command=options.command(),
                 seeds=[options.seed],
                 size=options.size,

@@ -27,9 +27,10 @@ from unghost import load_denoiser
 from unghost.baselines.filters import Classical
 from unghost.core.arrays import to_numpy
 from unghost.core.channels import encode_known, stack_channels
-from unghost.core.results import build_results, write_results
+from unghost.core.results import build_results
 from unghost.core.shards.packing import dequantize_share, dequantize_signed
 
+from ..compact import rounded, write_lines
 from ..fit_cache import file_hash, say
 from .figure import draw
 from .scores import score
@@ -198,7 +199,7 @@ def measure(options: Options) -> dict[str, Any]:
         results = build_results(
             rows, command=options.command(), seeds=[SEED], priors=priors, severities=list(SEVERITIES)
         )
-        write_results(options.out / "denoise.json", results)
+        write_lines(options.out / "denoise.json", rounded(results, 6))
     return results
 
 

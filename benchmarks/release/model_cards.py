@@ -22,7 +22,6 @@ from .readme import ROOT, load, number, table
 
 WEIGHTS = ROOT / "unghost" / "weights"
 CALLED = {"default": "unghost"}  # in the reference measurement
-OLDER = ("m",)  # its provenance is of another form; its card was written when it was shipped
 DATA = """unghost curate procedural --out out/procedural --n 64000 --seed 0 --workers 2
 unghost curate meshes --out out/meshes --n 40000 --seed 0 --workers 2 --mesh-root MESHES
 unghost harvest --out out/rooms --scenes 80 --first 4 --seed 1000 --cubes 112 --no-fit --workers 2 --mesh-root MESHES
@@ -54,9 +53,8 @@ SEEN_GHOSTS = (
 
 
 def models() -> list[tuple[str, Path, Manifest]]:
-    """Name, ONNX file and manifest of what is shipped and has its card from here."""
-    files = [path for path in sorted(WEIGHTS.glob("*.onnx")) if path.stem not in OLDER]
-    return [(path.stem, path, read_manifest(path)) for path in files]
+    """Name, ONNX file and manifest of every shipped model."""
+    return [(path.stem, path, read_manifest(path)) for path in sorted(WEIGHTS.glob("*.onnx"))]
 
 
 def size_of(manifest: Manifest) -> str:
@@ -125,7 +123,7 @@ def section(name: str, path: Path, manifest: Manifest) -> list[str]:
         for file in (path, path.with_suffix(".safetensors"))
     ]
     folder = run_folder(manifest, len(stages(training)) - 1)
-    command = chosen["command"].replace("ship.py ", f"ship.py {folder}/")
+    command = chosen["command"].replace("release.ship ", f"release.ship {folder}/")
     half = " Its weights are stored in half precision." if precision_of(manifest) == "fp16" else ""
     return [
         f"`{manifest.name}`, size {size_of(manifest).upper()}: {manifest.parameters} parameters, "

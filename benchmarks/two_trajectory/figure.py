@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from .compact import read_expanded
 from .tables import COLORS, REFERENCE, Cell, finished, main_rows, score_at
 
 DRAWN = (
@@ -35,8 +35,8 @@ def write_figures(path: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    results = json.loads(path.read_text(encoding="utf-8"))
-    rows = [row for row in main_rows(results, "main") if row["coverage"] and row["method"] != REFERENCE]
+    results = read_expanded(path)
+    rows = [row for row in main_rows(results, "main") if row.get("coverage") and row["method"] != REFERENCE]
     if not rows:
         return
     figure = Figure(figsize=(13, 9.4), facecolor="white", layout="constrained")
@@ -71,7 +71,7 @@ def _draw(axes: Any, cells: Sequence[Cell], rows: Sequence[dict[str, Any]], key:
         points = mean_curve(cells, row["method"], key, order)
         if points:
             axes.plot(*zip(*points), linewidth=2.0 if drawn else 1.0, label=label, color=color)
-        if row[key]:
+        if row.get(key):
             axes.plot(row["coverage"], row[key], "o", color=color, markersize=6 if drawn else 4)
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)

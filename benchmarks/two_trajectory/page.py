@@ -1,11 +1,10 @@
 """``docs/results/README.md``: who wins the two-trajectory benchmark where, in tables and plain words.
 
-python -m benchmarks.two_trajectory.page            reads two_trajectory.json, writes the page and the figures
+python -m benchmarks.two_trajectory.page            reads two_trajectory.json (means as stored), writes page and figures
 """
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -17,8 +16,9 @@ from unghost.evaluation.report.rows import convention_rows
 from unghost.evaluation.scoring.conventions import get_convention
 from unghost.evaluation.scoring.intervals import Interval
 
+from .compact import read_expanded
 from .figure import write_figures
-from .tables import KEYS, ORDERS, REFERENCE, finished, format_rows, main_rows, per_scene, summary_rows
+from .tables import ORDERS, REFERENCE, finished, format_rows, main_rows, per_scene, summary_rows
 
 ROOT = Path(__file__).resolve().parents[2]
 OURS = (
@@ -392,9 +392,7 @@ def notes(rows: list[Row]) -> list[str]:
 
 def main() -> None:
     path = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "docs" / "results" / "two_trajectory.json"
-    results = json.loads(path.read_text(encoding="utf-8"))
-    results["rows"] = summary_rows(results["cells"])
-    assert set(KEYS) <= set(results["rows"][0])
+    results = read_expanded(path)
     path.with_name("README.md").write_text(page(results, path.parent), encoding="utf-8")
     write_figures(path)
 

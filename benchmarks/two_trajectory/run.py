@@ -7,10 +7,10 @@
 A field is fitted to one sweep of photos, every method improves it (``methods.py``) for the same steps, and
 each is scored on another sweep under the convention ``proper``, at its own coverage and cut to others, in several
 orders of pixels (``scores.py``). Every finished row is saved at once in
-``docs/results/two_trajectory.json``; what is there is not done again, so that a run that was broken off goes on with
-the same command, and several processes may share the file, each with other scenes or seeds (with ``--threads 1``:
-means of seconds are over rows with the most threads). Knobs and the field of both sweeps are looked at on seed 0
-of the synthetic scenes alone.
+``docs/results/two_trajectory.json``, in the form of ``compact.py``; what is there is not done again, so that a run that
+was broken off goes on with the same command, and several processes may share the file, each with other scenes or seeds
+(with ``--threads 1``: means of seconds are over rows with the most threads). Knobs and the field of both sweeps are
+looked at on seed 0 of the synthetic scenes alone.
 ``--equal-seconds`` trains for as long as ``visibility`` took (the median of the main table), ``--ablation`` does the
 paper's ablation, ``--every-eighth`` scores every 8th photo of the first sweep. The page: ``page.py``.
 """
@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import dataclasses
 import fcntl
-import json
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -33,7 +32,7 @@ import torch
 import tyro
 from numpy.typing import NDArray
 
-from unghost.core.results import build_results, commit, write_results
+from unghost.core.results import build_results, commit
 from unghost.evaluation.captures.difficulty import difficulty_rows
 from unghost.evaluation.scoring.protocol import json_ready
 from unghost.fields.radiance import RadianceConfig, RadianceField
@@ -42,6 +41,7 @@ from unghost.fields.training import TrainingConfig, train_field
 
 from ..fit_cache import FitCache, Plan, say
 from .ablation import ABLATION
+from .compact import read_expanded, write_compact
 from .figure import write_figures
 from .job import Job, Outcome, Weights
 from .methods import FACTOR_OF, METHODS, UNTRAINED
@@ -135,7 +135,7 @@ class Ledger:
 
     def read(self) -> None:
         """What is on disk, other processes' rows, too."""
-        stored = json.loads(self.path.read_text(encoding="utf-8")) if self.path.exists() else {}
+        stored = read_expanded(self.path) if self.path.exists() else {}
         self.cells: list[dict[str, Any]] = stored.get("cells", [])
         self.scenes: dict[str, dict[str, Any]] = stored.get("scenes", {})
         self.commands: list[str] = [each for each in stored.get("command", "").split(" ; ") if each]
@@ -211,7 +211,7 @@ class Ledger:
             scenes=self.scenes,
             cells=self.cells,
         )
-        write_results(self.path, json_ready(results))
+        write_compact(self.path, json_ready(results))
 
 
 def fitted(

@@ -22,10 +22,12 @@ import numpy as np
 import torch
 import tyro
 
-from unghost.core.results import build_results, write_results
+from unghost.core.results import build_results
 from unghost.evaluation.scoring.protocol import json_ready
 
+from ..compact import write_lines
 from ..fit_cache import FitCache, say
+from .compact import compact_rows
 from .job import Job, Weights
 from .methods import FACTOR_OF, METHODS
 from .run import Options as Benchmark
@@ -125,8 +127,10 @@ def main() -> None:
     named = " ".join(options.losses)
     if options.losses != tuple(FACTORS):
         command = " ; ".join([stored.get("command", ""), *([f"{command} --losses {named}"] if named else [])])
-    results = build_results(rows, command=command, seeds=[0], scene_seed=options.scene_seed, threads=options.threads)
-    write_results(path, json_ready(results))
+    results = build_results(
+        compact_rows(rows), command=command, seeds=[0], scene_seed=options.scene_seed, threads=options.threads
+    )
+    write_lines(path, json_ready(results))
 
 
 if __name__ == "__main__":

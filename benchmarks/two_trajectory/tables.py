@@ -98,8 +98,8 @@ def summary_rows(cells: Sequence[Cell]) -> list[dict[str, Any]]:
             counted = [cell for cell in mine if key not in SECONDS or cell.get("threads", 0) == most]
             row[key], intervals[key] = _mean(counted, [_plain(cell, key) for cell in counted])
         for key in (f"{key}_{how}{order}" for key in AT_EQUAL for how in ("at_coverage", "area") for order in ORDERS):
-            row[key], intervals[key] = _mean(mine, [equal.get((_run(cell), method), {}).get(key) for cell in mine])
-        row["at_coverage"], _ = _mean(mine, [equal.get((_run(cell), method), {}).get("coverage") for cell in mine])
+            row[key], intervals[key] = _mean(mine, [equal.get((run_of(cell), method), {}).get(key) for cell in mine])
+        row["at_coverage"], _ = _mean(mine, [equal.get((run_of(cell), method), {}).get("coverage") for cell in mine])
         for coverage in FIXED:
             reached = [score_at(cells, cell, "psnr", coverage) for cell in mine]
             every = all(value is not None for value in reached)  # or hard scenes would drop out of the mean
@@ -131,11 +131,12 @@ def finished(cells: Sequence[Cell]) -> list[Cell]:
     for cell in cells:
         if cell["method"] not in FEWER_SEEDS and "@" not in cell["method"]:
             wanted.setdefault(cell["table"], set()).add(cell["method"])
-            found.setdefault(_run(cell), set()).add(cell["method"])
-    return [cell for cell in cells if wanted.get(cell["table"], set()) <= found.get(_run(cell), set())]
+            found.setdefault(run_of(cell), set()).add(cell["method"])
+    return [cell for cell in cells if wanted.get(cell["table"], set()) <= found.get(run_of(cell), set())]
 
 
-def _run(cell: Cell) -> tuple[Any, ...]:
+def run_of(cell: Cell) -> tuple[Any, ...]:
+    """What cells have in common that compare with one another."""
     return tuple(cell.get(key) for key in ("table", "scene", "seed", "steps", "fit_steps", "scene_seed"))
 
 
@@ -167,7 +168,9 @@ def score_at(cells: Sequence[Cell], cell: Cell, key: str, coverage: float, order
     same, orders = [cell], [order]
     if order is None:
         same += [
-            other for other in cells if _run(other) == _run(cell) and other["method"].startswith(f"{cell['method']} @ ")
+            other
+            for other in cells
+            if run_of(other) == run_of(cell) and other["method"].startswith(f"{cell['method']} @ ")
         ]
         orders = ["own", "spread", "photos"]
     curves = [_curve(each, name, key) for each in same for name in orders if name is not None]
@@ -175,18 +178,27 @@ def score_at(cells: Sequence[Cell], cell: Cell, key: str, coverage: float, order
     return (min if key in LOWER_IS_BETTER else max)(found, default=None)
 
 
+def compared(cells: Sequence[Cell]) -> list[Cell]:
+    """Cells of one run that lower the bar: neither other settings of a knob (``method @ knob``) nor the reference."""
+    return [cell for cell in cells if "@" not in cell["method"] and cell["method"] != REFERENCE]
+
+
+def lowest_coverage(cells: Sequence[Cell]) -> float:
+    """The coverage to which every method of one run is cut."""
+    return min((cell["coverage"] or 0.0 for cell in compared(cells)), default=0.0)
+
+
 def _at_equal_coverage(cells: Sequence[Cell]) -> dict[tuple[Any, str], dict[str, float | None]]:
     """(run, method) -> scores where all methods of the run are cut to the lowest coverage among them.
 
-    Other settings of a knob (``method @ knob``) do not lower the bar, and neither does the reference. A run in which
-    somebody covers less than any curve reaches is left out for all: scores at two coverages do not compare.
+    A run in which somebody covers less than any curve reaches is left out for all: scores at two coverages do not
+    compare.
     """
     result: dict[tuple[Any, str], dict[str, float | None]] = {}
-    for run in dict.fromkeys(map(_run, cells)):
-        mine = [cell for cell in cells if _run(cell) == run]
-        compared = [cell for cell in mine if "@" not in cell["method"] and cell["method"] != REFERENCE]
-        lowest = min((cell["coverage"] or 0.0 for cell in compared), default=0.0)
-        reached = [score_at(mine, cell, "psnr", lowest, "spread") for cell in compared]
+    for run in dict.fromkeys(map(run_of, cells)):
+        mine = [cell for cell in cells if run_of(cell) == run]
+        lowest = lowest_coverage(mine)
+        reached = [score_at(mine, cell, "psnr", lowest, "spread") for cell in compared(mine)]
         if not lowest or any(value is None for value in reached):
             continue
         turned = any("@" in cell["method"] for cell in mine)  # knobs are, on the first seed
@@ -228,7 +240,7 @@ def per_scene(cells: Sequence[Cell], methods: Sequence[str], key: str) -> dict[s
     for method in methods:
         values: dict[str, list[float]] = {}
         for cell in cells:
-            found = equal.get((_run(cell), method), {}).get(key, _plain(cell, key))
+            found = equal.get((run_of(cell), method), {}).get(key, _plain(cell, key))
             if cell["method"] == method and found is not None:
                 values.setdefault(cell["scene"], []).append(found)
         result[method] = {scene: float(np.mean(each)) for scene, each in values.items()}

@@ -12,6 +12,13 @@ needs_weights = pytest.mark.skipif(not (WEIGHTS / "default.onnx").is_file(), rea
     [
         ("absent", None, FileNotFoundError, "no file absent.onnx for 'absent'; shipped names: "),
         ("absent", "torch", FileNotFoundError, r"absent\.safetensors"),
+        (
+            "m",
+            None,
+            FileNotFoundError,
+            r"no file m\.onnx for 'm' \(no longer shipped: 'default' replaces it\); shipped names: ",
+        ),
+        ("m", "torch", FileNotFoundError, r"m\.safetensors for 'm' \(no longer shipped: 'default' replaces it\)"),
         ("x/absent.onnx", None, FileNotFoundError, r"x/absent\.onnx"),
         ("default", "jax", ValueError, r"backend must be one of \['onnx', 'torch'\], got 'jax'"),
         ("a.onnx", "torch", ValueError, r"backend 'torch' reads \.safetensors files, got a\.onnx"),

@@ -73,6 +73,7 @@ def test_wrong_words_exit_with_two(words, capsys):
         (["train", "absent=much", "--out", "x"], "must be FOLDER or FOLDER=WEIGHT"),
         (["demo", "--seed", "-1"], "unghost demo: "),
         (["bench", "--denoiser", "absent.onnx"], "unghost bench: load_denoiser: no file absent.onnx"),
+        (["bench", "--denoiser", "m"], "unghost bench: load_denoiser: no file m.onnx for 'm' (no longer shipped"),
         (["verify", "--onnx", "a.onnx", "--checkpoint", "b.safetensors"], "unghost verify: "),
         (["export", "absent.safetensors"], "unghost export: "),
     ],
