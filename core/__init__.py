@@ -71,6 +71,7 @@ if TYPE_CHECKING:
     from .ray_distortion import distortion as distortion
     from .results import build_results as build_results
     from .results import commit as commit
+    from .results import json_ready as json_ready
     from .results import versions as versions
     from .results import write_results as write_results
     from .schedule import TIMESTEPS as TIMESTEPS
@@ -127,7 +128,7 @@ __getattr__, __dir__, __all__ = attach(
             "warn_if_constant",
         ],
         ".ray_distortion": ["distortion"],
-        ".results": ["build_results", "commit", "versions", "write_results"],
+        ".results": ["build_results", "commit", "json_ready", "versions", "write_results"],
         ".schedule": [
             "TIMESTEPS",
             "alphas_cumprod",

@@ -33,9 +33,8 @@ import torch
 import tyro
 from numpy.typing import NDArray
 
-from unghost.core.results import build_results, commit, write_results
+from unghost.core.results import build_results, commit, json_ready, write_results
 from unghost.evaluation.captures.difficulty import difficulty_rows
-from unghost.evaluation.scoring.protocol import json_ready
 from unghost.fields.radiance import RadianceConfig, RadianceField
 from unghost.fields.rendering import render_view
 from unghost.fields.training import TrainingConfig, train_field

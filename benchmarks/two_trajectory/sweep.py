@@ -22,8 +22,7 @@ import numpy as np
 import torch
 import tyro
 
-from unghost.core.results import build_results, write_results
-from unghost.evaluation.scoring.protocol import json_ready
+from unghost.core.results import build_results, json_ready, write_results
 
 from ..fit_cache import FitCache, say
 from .job import Job, Weights

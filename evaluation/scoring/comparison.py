@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.results import json_ready
 from ..metrics.checks import Mask
 from ..metrics.perceptual import Lpips
 from ..report.rows import convention_rows
@@ -23,7 +24,7 @@ from .conventions import (
 from .curves import Curve, against_points, compare, cut_to_coverage
 from .engine import SceneScores, score_scene, score_under_all, summarize
 from .intervals import RESAMPLES, bootstrap_difference
-from .protocol import common_mask, json_ready
+from .protocol import common_mask
 from .renders import Method
 from .views import Truth
 

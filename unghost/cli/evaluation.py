@@ -163,7 +163,7 @@ class _Scene:
 
 
 def _methods(folders: Mapping[str, Path], scene: _Scene, depth_along: str) -> list[Method]:
-    from ..evaluation.scoring.protocol import ray_depth
+    from ..evaluation.scoring.depths import ray_depth
     from ..evaluation.scoring.renders import read_method
 
     shape = scene.truth.photos.shape[1], scene.truth.photos.shape[2]
