@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.metrics import get_metric
 from ..metrics.checks import Mask
 from .conventions import one_convention
 
@@ -58,7 +59,7 @@ class Curve:
         *,
         metric: str = "psnr",
         knob: str | None = None,
-        higher_is_better: bool = True,
+        higher_is_better: bool | None = None,
     ) -> Curve:
         """From results rows, one a setting of the knob, in any order.
 
@@ -67,11 +68,13 @@ class Curve:
             rows: each with ``coverage``, the metric, one common ``convention``, and the knob's value.
             metric: the rows' key.
             knob: the rows' key; None for a method without one.
-            higher_is_better: False for errors.
+            higher_is_better: of the metric; None for what the registry says (:mod:`unghost.core.metrics`).
 
         Raises:
             ValueError: rows of two conventions (both named), coverages outside [0, 1], or no row with a finite score.
         """
+        if higher_is_better is None:
+            higher_is_better = get_metric(metric).better == "higher"
         convention = one_convention("Curve.create", rows)
         triples = [(row.get("coverage"), row.get(metric), np.nan if knob is None else row[knob]) for row in rows]
         known = [
