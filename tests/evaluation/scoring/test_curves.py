@@ -171,6 +171,6 @@ def test_the_direction_of_a_metric_is_that_of_the_registry():
     assert not curve.higher_is_better
     assert curve.score.tolist() == [0.2]  # of one coverage the better counts
     other = [{**row, "own": row["disparity_mae"]} for row in rows]
-    with pytest.raises(ValueError, match="key must be one of psnr, .* got 'own'"):
+    with pytest.raises(ValueError, match=r"key must be one of psnr, .* got 'own'"):
         Curve.create("a", other, metric="own")
     assert Curve.create("a", other, metric="own", higher_is_better=True).score.tolist() == [0.3]
