@@ -10,9 +10,9 @@ if TYPE_CHECKING:
     from .scoring.conventions import SceneExtent as SceneExtent
     from .scoring.engine import SceneScores as SceneScores
     from .scoring.engine import score_scene as score_scene
-    from .scoring.evaluation import Results as Results
     from .scoring.evaluation import evaluate as evaluate
     from .scoring.renders import Method as Method
+    from .scoring.results import Results as Results
     from .scoring.views import Renders as Renders
     from .scoring.views import Truth as Truth
 
@@ -21,8 +21,9 @@ __getattr__, __dir__, __all__ = attach(
     {
         ".scoring.conventions": ["SceneExtent"],
         ".scoring.engine": ["SceneScores", "score_scene"],
-        ".scoring.evaluation": ["Results", "evaluate"],
+        ".scoring.evaluation": ["evaluate"],
         ".scoring.renders": ["Method"],
+        ".scoring.results": ["Results"],
         ".scoring.views": ["Renders", "Truth"],
     },
 )
