@@ -55,6 +55,10 @@ if TYPE_CHECKING:
     from .manifest import METADATA_KEY as METADATA_KEY
     from .manifest import Denoiser as Denoiser
     from .manifest import Manifest as Manifest
+    from .metrics import METRICS as METRICS
+    from .metrics import Metric as Metric
+    from .metrics import format_value as format_value
+    from .metrics import get_metric as get_metric
     from .occupancy import DECISION as DECISION
     from .occupancy import DEFAULT_OPACITY_THRESHOLD as DEFAULT_OPACITY_THRESHOLD
     from .occupancy import EMPTY as EMPTY
@@ -71,6 +75,7 @@ if TYPE_CHECKING:
     from .ray_distortion import distortion as distortion
     from .results import build_results as build_results
     from .results import commit as commit
+    from .results import json_ready as json_ready
     from .results import versions as versions
     from .results import write_results as write_results
     from .schedule import TIMESTEPS as TIMESTEPS
@@ -111,6 +116,7 @@ __getattr__, __dir__, __all__ = attach(
         ".lattice": ["cell_centers", "cell_pitch", "cells_within", "lattice_axes", "lattice_origin", "look_up_cells"],
         ".lazy": ["attach"],
         ".manifest": ["Denoiser", "METADATA_KEY", "Manifest"],
+        ".metrics": ["METRICS", "Metric", "format_value", "get_metric"],
         ".occupancy": [
             "DECISION",
             "DEFAULT_OPACITY_THRESHOLD",
@@ -127,7 +133,7 @@ __getattr__, __dir__, __all__ = attach(
             "warn_if_constant",
         ],
         ".ray_distortion": ["distortion"],
-        ".results": ["build_results", "commit", "versions", "write_results"],
+        ".results": ["build_results", "commit", "json_ready", "versions", "write_results"],
         ".schedule": [
             "TIMESTEPS",
             "alphas_cumprod",

@@ -147,36 +147,38 @@ class Cameras:
         In view: depth > 0, inside the image, and not folded back by the distortion polynomial.
         """
         local = (np.asarray(positions, dtype=np.float64) - self.origins[index]) @ self.camera_to_world[index, :, :3]
-        depth = -local[..., 2]
-        front = depth > 0
-        safe = np.where(front, depth, 1.0)
-        x, y = local[..., 0] / safe, -local[..., 1] / safe
         bend = self.distortion[index]
-        front &= x * x + y * y < largest_radius(bend) ** 2
-        x, y = np.where(front, x, 0.0), np.where(front, y, 0.0)
-        u, v = distort(x, y, bend)
-        fx, fy, cx, cy = self.intrinsics[index]
-        pixels = np.stack([u * fx + cx, v * fy + cy], axis=-1)
-        visible = front & (pixels[..., 0] >= 0) & (pixels[..., 0] <= self.width)
-        visible &= (pixels[..., 1] >= 0) & (pixels[..., 1] <= self.height)
-        return pixels, depth, visible
+        column, row, depth, visible = self._project(local, self.intrinsics[index], bend, largest_radius(bend))
+        return np.stack([column, row], axis=-1), depth, visible
 
     def sees(self, indices: NDArray[np.integer], positions: NDArray[Any]) -> NDArray[np.bool_]:
         """Whether camera ``indices[k]`` has ``positions[k]`` in view, by the rule of :meth:`project`: ``(K,)``."""
         points, poses = np.asarray(positions, dtype=np.float64), self.camera_to_world[indices]
         local = np.einsum("ka,kab->kb", points - poses[:, :, 3], poses[:, :, :3])
-        depth = -local[:, 2]
-        front = depth > 0
-        safe = np.where(front, depth, 1.0)
-        x, y = local[:, 0] / safe, -local[:, 1] / safe
         lenses, which = np.unique(self.distortion, axis=0, return_inverse=True)
         radius = np.array([largest_radius(bend) for bend in lenses])[which.reshape(-1)][indices]
+        return self._project(local, self.intrinsics[indices].T, self.distortion[indices].T, radius)[-1]
+
+    def _project(
+        self, local: FloatArray, intrinsics: FloatArray, distortion: FloatArray, radius: FloatArray | float
+    ) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
+        """Points in a camera's axes ``(..., 3)`` to columns, rows, depths and whether they are in view, each ``(...)``.
+
+        ``intrinsics (4,)``, ``distortion (6,)`` and ``radius`` are those of one camera, or have a last axis of one
+        camera a point. Every projection goes through here but the counting of views, which needs no pixels: there a
+        frustum is four planes (``core/visibility/view_counts.py``, ``regularizer/view_grid.py``).
+        """
+        depth = -local[..., 2]
+        front = depth > 0
+        safe = np.where(front, depth, 1.0)
+        x, y = local[..., 0] / safe, -local[..., 1] / safe
         front &= x * x + y * y < radius**2
         x, y = np.where(front, x, 0.0), np.where(front, y, 0.0)
-        u, v = distort(x, y, self.distortion[indices].T)
-        fx, fy, cx, cy = self.intrinsics[indices].T
+        u, v = distort(x, y, distortion)
+        fx, fy, cx, cy = intrinsics
         column, row = u * fx + cx, v * fy + cy
-        return np.asarray(front & (column >= 0) & (column <= self.width) & (row >= 0) & (row <= self.height))
+        visible = front & (column >= 0) & (column <= self.width) & (row >= 0) & (row <= self.height)
+        return column, row, depth, visible
 
     def view_count(
         self, positions: Any, *, depth_maps: NDArray[Any] | None = None, tolerance: float = 0.05

@@ -12,6 +12,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 REPORTED_PACKAGES = ("numpy", "onnxruntime", "torch", "scipy", "scikit-image", "open3d-cpu", "trimesh")
 
 
@@ -78,3 +80,14 @@ def write_results(path: str | Path, results: Mapping[str, Any]) -> None:
     partial = target.with_name(target.name + ".partial")
     partial.write_text(json.dumps(results, indent=1, sort_keys=False, allow_nan=False) + "\n", encoding="utf-8")
     os.replace(partial, target)
+
+
+def json_ready(value: Any) -> Any:
+    """A copy in which NaN and infinities are None (JSON null) and numpy numbers are Python's."""
+    if isinstance(value, Mapping):
+        return {key: json_ready(each) for key, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [json_ready(each) for each in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not np.isfinite(value) else value

@@ -3,7 +3,9 @@
 A cell wholly inside a frustum is seen by that camera, one wholly beyond a side of it is not. With distortion a
 frustum's sides are bent: each is put between two flat ones (the rectangles inside and about the undistorted image).
 Cells in which cameras disagree are cut in eight, twice over; points in what is open then are held against the flat
-sides themselves, and the few that lie between the inner and the outer one are left to the exact test.
+sides themselves, and the few that lie between the inner and the outer one are left to the exact test,
+:meth:`Cameras.sees`. Counting up to one view at 32,768 points with 100 cameras takes .3 ms (.6 ms with distortion),
+up to 50 views 33 ms (57 ms), where projecting every point with :meth:`Cameras.project` takes 180 to 355 ms (one core).
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ from unghost.data_recipes.harvest.config import HarvestConfig
 from unghost.data_recipes.harvest.labels import BEHIND_BAND, FREE_BAND, SURFACE_BAND
 from unghost.data_recipes.harvest.run import harvest_cubes
 from unghost.evaluation.captures.loading import load_capture
-from unghost.evaluation.scoring.protocol import optical_depth
+from unghost.evaluation.scoring.depths import optical_depth
 
 from ..fit_cache import FitCache, code_hash, file_hash, say
 from ..two_trajectory.real_capture import Options as CaptureOptions

@@ -21,8 +21,8 @@ import numpy as np
 
 from unghost.core.cameras import Cameras
 from unghost.core.results import build_results, write_results
+from unghost.evaluation.scoring.depths import ray_depth
 from unghost.evaluation.scoring.engine import score_scene
-from unghost.evaluation.scoring.protocol import ray_depth
 from unghost.evaluation.scoring.pseudo_truth import PseudoTruth, make_pseudo_truth
 from unghost.evaluation.scoring.views import Renders, Truth
 from unghost.integrations.nerfbaselines.protocol import MASKS_VARIABLE, PROTOCOLS, MaskedProtocol

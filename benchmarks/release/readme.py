@@ -12,6 +12,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from unghost.core.metrics import format_value, get_metric
+
 ROOT = Path(__file__).resolve().parents[2]
 BEGIN, END = "<!-- results: written by benchmarks/release/readme.py -->", "<!-- end of results -->"
 Row = dict[str, Any]
@@ -22,8 +24,9 @@ def load(name: str, root: Path = ROOT) -> dict[str, Any]:
     return loaded
 
 
-def number(value: float | None, digits: int = 3) -> str:
-    return "–" if value is None else f"{value:.{digits}f}"
+def headings(keys: Iterable[str], **told: str) -> list[str]:
+    """The metrics' labels, or what a table calls them instead."""
+    return [told.get(key, get_metric(key).label) for key in keys]
 
 
 def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
@@ -32,13 +35,14 @@ def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
 
 
 def demo(results: dict[str, Any]) -> list[str]:
-    keys = ("floater_recall", "floater_precision", "surface_kept", "iou_before", "iou")
-    rows = [[row["method"], *(number(row[key]) for key in keys), number(row["seconds"], 1)] for row in results["rows"]]
-    head = ("method", "ghosts removed", "of what was removed, ghosts", "surface kept", "IoU before", "after", "seconds")
+    keys = ("floater_recall", "floater_precision", "surface_kept", "iou_before", "iou", "seconds")
+    rows = [[row["method"], *(format_value(row[key], key) for key in keys)] for row in results["rows"]]
+    head = ["method", *headings(keys, floater_precision="of what was removed, ghosts", iou="after")]
     said = "The prior's removal threshold was chosen on other rooms of this kind (`benchmarks/release/ship.py`)."
     return ["**The demo's room** (`make demo`; every ghost labelled):", "", *table(head, rows), "", said]
 
 
+GONE = "ghosts_removed_98"
 SHIPPED = ("unghost", "xs", "views")  # as the reference measurement calls the default and the others
 RETIRED = ("m",)  # measured while it was shipped
 FOG = {
@@ -75,11 +79,11 @@ def denoise(results: dict[str, Any]) -> list[str]:
     ]
     lines = []
     for method in methods:
-        ious = [number(found[(method, *key)]["iou"]) for key in wanted]
+        ious = [format_value(found[(method, *key)]["iou"], "iou") for key in wanted]
         bubbles = " / ".join(
-            number(found[method, "bubbles", family, None]["ghosts_removed_98"], 2) for family in ("bits", "soft")
+            format_value(found[method, "bubbles", family, None][GONE], GONE) for family in ("bits", "soft")
         )
-        speed = f"{speeds[method]['cubes_per_second']:.0f}" if method in speeds else "–"
+        speed = format_value(speeds.get(method, {}).get("cubes_per_second"), "cubes_per_second")
         lines.append([method, *ious, bubbles, speed])
     text = [
         "**Cubes of meshes that were never trained on**, one step at the default timestep (mean IoU with the truth, "
@@ -137,16 +141,16 @@ MODEL_HEAD = (
 def _model(row: Row, found: dict[Any, Row]) -> list[str]:
     """How good on mixed corruption a model is, how large, and how fast."""
     wanted = (("synthetic", "mixed", "mean"), ("clean", None, None))
-    ious = [number(found[(row["method"], *key)]["iou"]) for key in wanted]
-    speeds = [f"{row[key]:.0f}" if key in row else "–" for key in ("cubes_per_second", "torch_cubes_per_second")]
+    ious = [format_value(found[(row["method"], *key)]["iou"], "iou") for key in wanted]
+    speeds = [format_value(row.get(key), key) for key in ("cubes_per_second", "torch_cubes_per_second")]
     seen = ", ".join(name.removeprefix("signed_").replace("_count", "s") for name in row["channels"])
     return [
         row["method"],
         seen,
         *ious,
         str(row["parameters"]),
-        number(row["gflop"], 2),
-        number(row["megabytes"], 2),
+        format_value(row["gflop"], "gflop"),
+        format_value(row["megabytes"], "megabytes"),
         row["precision"],
         *speeds,
     ]
@@ -154,7 +158,7 @@ def _model(row: Row, found: dict[Any, Row]) -> list[str]:
 
 def _beaten(found: dict[Any, Row], name: str, shown: list[str]) -> str:
     """Which of the shipped priors lose to something else on a set of fog, in a sentence."""
-    scores = {key[0]: row["ghosts_removed_98"] for key, row in found.items() if key[1] == name and key[0] in shown}
+    scores = {key[0]: row[GONE] for key, row in found.items() if key[1] == name and key[0] in shown}
     best = max(
         (method for method in scores if method.split(",")[0] not in SHIPPED + RETIRED),
         key=lambda method: scores[method],
@@ -166,7 +170,7 @@ def _beaten(found: dict[Any, Row], name: str, shown: list[str]) -> str:
 
 
 def _removed(row: Row) -> str:
-    return " / ".join(number(row[f"ghosts_removed_{kept}"], 2) for kept in (98, 90))
+    return " / ".join(format_value(row[key], key) for key in (GONE, "ghosts_removed_90"))
 
 
 def channels(results: dict[str, Any]) -> list[str]:
@@ -177,8 +181,8 @@ def channels(results: dict[str, Any]) -> list[str]:
     lines = [
         [
             name,
-            number(found[name, "clean", None]["iou"]),
-            number(found[name, "synthetic", "mean"]["iou"]),
+            format_value(found[name, "clean", None]["iou"], "iou"),
+            format_value(found[name, "synthetic", "mean"]["iou"], "iou"),
             *(_removed(found[name, fog, None]) for fog in FOG if (name, fog, None) in found),
         ]
         for name in methods
@@ -208,7 +212,7 @@ def statistics(results: dict[str, Any]) -> list[str]:
         "procedural, soft",
         "procedural, bits",
     )
-    lines = [[name, number(distances[name])] for name in shown if name in distances]
+    lines = [[name, format_value(distances[name], "distance")] for name in shown if name in distances]
     return [
         "**Do training cubes look like a real capture's field?** Distance of what the cubes show, in [0, 1]; two "
         f"halves of the capture's own cubes are at {results['sampling_floor']:.3f} ([the harvest](docs/harvest.md)):",
@@ -222,9 +226,10 @@ def capture(results: dict[str, Any]) -> list[str]:
     names |= {
         row["method"]: f"(c) + visibility + {row['method'].replace('dsds', 'DSDS')}" for row in results["rows"][2:]
     }
-    keys = (("psnr", 2), ("psnr_common", 2), ("ssim", 3), ("disparity_mae", 3), ("normal_mean_deg", 1), ("coverage", 3))
-    rows = [[names[row["method"]], *(number(row[key], digits) for key, digits in keys)] for row in results["rows"]]
-    head = ("", "PSNR (own mask)", "PSNR (common mask)", "SSIM", "disparity error", "normals, mean °", "coverage")
+    keys = ("psnr", "psnr_common", "ssim", "disparity_mae", "normal_mean_deg", "coverage")
+    rows = [[names[row["method"]], *(format_value(row[key], key) for key in keys)] for row in results["rows"]]
+    told = {"psnr": "PSNR (own mask)", "psnr_common": "PSNR (common mask)", "disparity_mae": "disparity error"}
+    head = ["", *headings(keys, **told)]
     seeds, priors = len(results["seeds"]), results.get("priors") or {"dsds": results["prior"]}
     called = ", ".join(f"{prior['name']} {prior['sha256'][:8]}" for prior in priors.values())
     return [
@@ -247,7 +252,7 @@ def verdict(rows: dict[str, Row]) -> str:
         if not method.startswith("dsds"):
             continue
         gain, name = rows[method]["psnr"] - rows["visibility"]["psnr"], method.replace("dsds", "DSDS")
-        depth = [number(rows[of]["disparity_mae"]) for of in (method, "visibility")]
+        depth = [format_value(rows[of]["disparity_mae"], "disparity_mae") for of in (method, "visibility")]
         said.append(
             f"{name} {'adds' if gain > 0 else '**loses**'} {abs(gain):.2f} dB to visibility alone; its disparity "
             f"error is {depth[0]}, that of visibility alone {depth[1]}."
@@ -257,7 +262,12 @@ def verdict(rows: dict[str, Row]) -> str:
 
 def curate(results: dict[str, Any]) -> list[str]:
     rows = [
-        [row["method"], f"{row['cubes_per_second']:.0f}", number(row["milliseconds"], 2), number(row["iou"])]
+        [
+            row["method"],
+            format_value(row["cubes_per_second"], "cubes_per_second"),
+            f"{row['milliseconds']:.2f}",
+            format_value(row["iou"], "iou"),
+        ]
         for row in results["rows"]
         if "sweep" not in row
     ]
@@ -276,10 +286,10 @@ def splats(results: dict[str, Any]) -> list[str]:
     lines = []
     for method in methods:
         rows = [row for row in results["rows"] if row["method"] == method]
-        means = [number(sum(row[key] for row in rows) / len(rows)) for key in keys]
+        means = [format_value(sum(row[key] for row in rows) / len(rows), key) for key in keys]
         seconds = sorted(row["seconds"] for row in rows)
-        worst = number(min(row["surface_kept"] for row in rows))
-        lines.append([method, *means, worst, number(seconds[len(seconds) // 2], 1)])
+        worst = format_value(min(row["surface_kept"] for row in rows), "surface_kept")
+        lines.append([method, *means, worst, format_value(seconds[len(seconds) // 2], "seconds")])
     head = (
         "method",
         "floaters removed",
@@ -306,8 +316,7 @@ def two_trajectory(results: dict[str, Any]) -> list[str]:
     rows = [row for row in results["rows"] if row["table"] == "main" and "@" not in row["method"]]
     equal = ("psnr_at_coverage", "psnr_area", "psnr_area_by_photos", "disparity_mae_area")
     own = ("psnr", "coverage", "free_space_error", "cpu_seconds")
-    digits = dict(zip((*equal, *own), (2, 2, 2, 3, 2, 3, 4, 0)))
-    lines = [[row["method"], *(number(row.get(key), digits[key]) for key in (*equal, *own))] for row in rows]
+    lines = [[row["method"], *(format_value(row.get(key), key) for key in (*equal, *own))] for row in rows]
     head = (
         "method",
         "PSNR, equal coverage",

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from unghost.core.metrics import get_metric
+
 from .compact import read_expanded
 from .tables import COLORS, REFERENCE, Cell, finished, main_rows, score_at
 
@@ -26,7 +28,8 @@ DRAWN = (
 )
 OTHERS = "#d0d0d0"
 ROWS = {"own": "each cut in its own order of pixels", "photos": "all cut by photo doubt"}
-COLUMNS = {"psnr": "PSNR, dB (higher is better)", "disparity_mae": "disparity error (lower is better)"}
+COLUMNS = ("psnr", "disparity_mae")
+UNITS = {"dB": ", dB"}  # worth a word on an axis
 
 
 def write_figures(path: Path) -> None:
@@ -43,10 +46,10 @@ def write_figures(path: Path) -> None:
     FigureCanvasAgg(figure)
     grid = figure.subplots(len(ROWS), len(COLUMNS), squeeze=False, sharex=True, sharey="col")
     for line, (order, said) in zip(grid, ROWS.items()):
-        for axes, (key, label) in zip(line, COLUMNS.items()):
+        for axes, key in zip(line, COLUMNS):
             _draw(axes, results["cells"], rows, key, order)
             axes.set_title(said, fontsize=11, loc="left")
-            axes.set_ylabel(label)
+            axes.set_ylabel(axis_label(key))
             if key == "disparity_mae":
                 axes.set_yscale("log")
                 for ticks in ("major", "minor"):
@@ -57,6 +60,12 @@ def write_figures(path: Path) -> None:
     scenes, runs = {name for row in rows for name in row["scenes"]}, max(row["runs"] for row in rows)
     figure.suptitle(f"Two trajectories: {len(scenes)} scenes, {runs} runs a method at most; dots: uncut", fontsize=12)
     figure.savefig(path.with_suffix(".png"), dpi=100, metadata={"Software": None})
+
+
+def axis_label(key: str) -> str:
+    """A metric's name, unit and direction."""
+    metric = get_metric(key)
+    return f"{metric.name}{UNITS.get(metric.unit, '')} ({metric.better} is better)"
 
 
 def _draw(axes: Any, cells: Sequence[Cell], rows: Sequence[dict[str, Any]], key: str, order: str) -> None:

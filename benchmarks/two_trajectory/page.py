@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import sem, t
 
+from unghost.core.metrics import get_metric
 from unghost.evaluation.report.rows import convention_rows
 from unghost.evaluation.scoring.conventions import get_convention
 from unghost.evaluation.scoring.intervals import Interval
@@ -52,18 +53,19 @@ ROWS = {
     "the field trains on (`RemovalLoss`): the photos may object",
     "clean": "ours: `unghost.clean` on `fitted`, or after another method (`…+clean`)",
 }
-PLAIN = {
-    "psnr_at_coverage": ("masked PSNR at equal coverage", " dB", 1, 2),
-    "psnr_area": ("masked PSNR, mean over equal coverages", " dB", 1, 2),
-    "psnr_area_by_photos": ("masked PSNR, mean, all cut by photo doubt", " dB", 1, 2),
-    "psnr_area_by_spread": ("masked PSNR, mean, all cut by spread of depth", " dB", 1, 2),
-    "ssim_at_coverage": ("masked SSIM at equal coverage", "", 1, 3),
-    "ssim_area": ("masked SSIM, mean over equal coverages", "", 1, 3),
-    "disparity_mae_at_coverage": ("disparity error at equal coverage", "", -1, 3),
-    "disparity_mae_area": ("disparity error, mean over equal coverages", "", -1, 3),
-    "disparity_mae_area_by_photos": ("disparity error, mean, all cut by photo doubt", "", -1, 3),
-    "free_space_error": ("opacity left in free space", "", -1, 4),
-}
+PLAIN = (
+    "psnr_at_coverage",
+    "psnr_area",
+    "psnr_area_by_photos",
+    "psnr_area_by_spread",
+    "ssim_at_coverage",
+    "ssim_area",
+    "disparity_mae_at_coverage",
+    "disparity_mae_area",
+    "disparity_mae_area_by_photos",
+    "free_space_error",
+)
+UNITS = {"dB": " dB"}  # worth a word behind a number
 OTHER_TABLES = {
     "every 8th photo": "Scored on every 8th photo of the training sweep (faults and all), as most papers do: what that "
     "hides",
@@ -80,7 +82,9 @@ def who_wins(results: dict[str, Any]) -> list[str]:
     methods = [row for row in main_rows(results, "main") if row["method"] != REFERENCE]
     head = ("score", "", "our best", "best rival", "ours is better by (95 %)", *(f"`{name}`" for name in WATCHED))
     lines = [f"| {' | '.join(head)} |", "| --- |" + " --- |" * (len(head) - 1)]
-    for key, (name, unit, sign, digits) in PLAIN.items():
+    for key in PLAIN:
+        metric = get_metric(key)
+        name, unit, sign, digits = metric.name, UNITS.get(metric.unit, ""), metric.sign, metric.decimals
         known = sorted((row for row in methods if row.get(key) is not None), key=lambda row: -sign * row[key])
         one_order = "_by_" in key or key == "free_space_error"
         ours = [row for row in known if row["method"] in OURS and not (one_order and row["method"] == NOTHING_OF_OURS)]

@@ -4,7 +4,7 @@
 
 A field is fitted to the training sweep, a pseudo-ground-truth field to both. The first is then
 fine-tuned with (a) nothing more, (b) the visibility loss, (c) visibility and DSDS, for the same steps
-from the same seed, and each is scored on the evaluation sweep (``evaluation/scoring/protocol.py``). Writes
+from the same seed, and each is scored on the evaluation sweep under the convention ``paper_text``. Writes
 ``capture.json`` and ``capture.png``. Fitted fields and renderings are kept in ``--cache``, so that a
 run can be broken off and resumed, and other regularizer settings cost their own fine-tuning only.
 """
@@ -27,10 +27,13 @@ import unghost.fields
 import unghost.regularizer
 from unghost import load_denoiser
 from unghost.core.cameras import Cameras
-from unghost.core.results import build_results, write_results
+from unghost.core.results import build_results, json_ready, write_results
 from unghost.evaluation.captures.loading import load_capture
 from unghost.evaluation.report.rows import draw_comparison, format_table, mean_over_seeds
-from unghost.evaluation.scoring import protocol
+from unghost.evaluation.scoring.conventions import SceneExtent, evaluation_masks, get_convention
+from unghost.evaluation.scoring.engine import score_scene
+from unghost.evaluation.scoring.protocol import common_mask, visibility_masks
+from unghost.evaluation.scoring.views import Renders, Truth
 from unghost.fields.radiance import RadianceConfig, RadianceField
 from unghost.fields.rendering import render_view
 from unghost.fields.training import train_field
@@ -43,6 +46,7 @@ from .scenes import Sweep
 ROOT = Path(__file__).resolve().parents[2]
 WITHOUT_PRIOR = {"field": "(a) fine-tuned alone", "visibility": "(b) + visibility"}
 FIGURE_VIEWS = 4
+CONVENTION = "paper_text"
 Views = dict[str, NDArray[Any]]
 
 
@@ -127,7 +131,7 @@ def _literal(text: str) -> Any:
 def render(field: RadianceField, cameras: Cameras) -> Views:
     """All views: ``rgb (n, H, W, 3)``, ``depth (n, H, W)``."""
     views = [render_view(field, cameras, index) for index in range(len(cameras))]
-    return {key: protocol.stack(views, key) for key in ("rgb", "depth")}
+    return {key: np.stack([view[key] for view in views]) for key in ("rgb", "depth")}
 
 
 def fit_field(options: Options, cache: FitCache, name: str, sweep: Sweep, seed: int) -> tuple[RadianceField, Any]:
@@ -178,19 +182,27 @@ def tuning_key(options: Options, method: str, weights: dict[str, dict[str, str]]
     return {**key, "prior": weights[method]} if method in weights else key
 
 
-def score_seed(
-    seed: int, tuned: dict[str, Views], sweep: Sweep, pseudo: Any, visible: Any, limit: float
-) -> dict[str, dict[str, Any]]:
-    """Scores of every method of one seed, on its own pixels and on those that all have."""
-    shared = protocol.common_mask([visible & protocol.depth_masks(views["depth"], limit) for views in tuned.values()])
-    scores = {}
-    for method, views in tuned.items():
-        rendered = [{"rgb": rgb, "depth": depth} for rgb, depth in zip(views["rgb"], views["depth"])]
-        found = protocol.score(
-            rendered, sweep.photos, pseudo, sweep.cameras, visible=visible, limit=limit, common=shared
-        )
-        scores[method] = {"seed": seed, **found, "seconds": float(views["seconds"])}
-    return scores
+def score_seed(seed: int, tuned: dict[str, Views], truth: Truth, extent: SceneExtent) -> dict[str, dict[str, Any]]:
+    """Scores of every method of one seed: on its own pixels, on those that all have, on all that are visible."""
+    rule = get_convention(CONVENTION)
+    renders = {method: Renders(np.clip(views["rgb"], 0, 1), views["depth"]) for method, views in tuned.items()}
+    shared = common_mask([evaluation_masks(rule, each, truth, extent) for each in renders.values()])
+    rows = {}
+    for method, each in renders.items():
+        scores = score_scene(each, truth, extent, convention=CONVENTION)
+        common = score_scene(
+            each, truth, extent, convention=CONVENTION, within=shared, keys=("psnr", "coverage")
+        ).means()
+        visible = score_scene(each, truth, None, convention="visible_only", keys=("psnr",)).means()
+        rows[method] = {
+            "seed": seed,
+            **{key: value for key, value in scores.means().items() if key not in scores.notes},
+            "psnr_visible": visible["psnr"],
+            "psnr_common": common["psnr"],
+            "coverage_common": common["coverage"],
+            "seconds": float(tuned[method]["seconds"]),
+        }
+    return rows
 
 
 def run(options: Options) -> dict[str, Any]:
@@ -217,8 +229,10 @@ def run(options: Options) -> dict[str, Any]:
     pseudo_field, pseudo_record = fit_field(options, cache, "pseudo", both, 0)
     key = {"field": pseudo_record["sha256"], "code": code_hash(unghost.fields), "eval": evaluation.digest()}
     pseudo_views = cache.views("pseudo", key, functools.partial(render, pseudo_field, evaluation.cameras))
-    limit = options.depth_limit or protocol.depth_limit(train.cameras, evaluation.cameras)
-    visible = protocol.visibility_masks(evaluation.cameras, pseudo_views["depth"], train.cameras)
+    extent = SceneExtent.of(train.cameras, evaluation.cameras)
+    extent = dataclasses.replace(extent, limit=options.depth_limit or extent.limit)
+    visible = visibility_masks(evaluation.cameras, pseudo_views["depth"], train.cameras)
+    truth = Truth(evaluation.photos, visible, pseudo_views["depth"], cameras=evaluation.cameras)
 
     records, per_seed = [], []
     for seed in options.seeds:
@@ -233,7 +247,7 @@ def run(options: Options) -> dict[str, Any]:
             make = functools.partial(fine_tune, options, base, train, evaluation, seed, method, used)
             tuned[method] = cache.views(f"{method}-{seed}", key, make)
         shown = tuned if seed == options.seeds[0] else shown
-        per_seed.append(score_seed(seed, tuned, evaluation, pseudo_views["depth"], visible, limit))
+        per_seed.append(score_seed(seed, tuned, truth, extent))
     rows = [mean_over_seeds(method, [scores[method] for scores in per_seed]) for method in methods]
     results = build_results(
         rows,
@@ -242,19 +256,19 @@ def run(options: Options) -> dict[str, Any]:
         capture=capture.folder.resolve().name,
         priors=weights,
         regularizer={k: v for k, v in dataclasses.asdict(RegularizerSettings(**overrides)).items() if k != "seed"},
-        depth_limit=limit,
+        depth_limit=extent.limit,
         visible_share=float(visible.mean()),
         fields=records,
         pseudo_ground_truth=pseudo_record,
     )
-    write_results(options.out / "capture.json", protocol.json_ready(results))
+    write_results(options.out / "capture.json", json_ready(results))
     draw(
         options,
         {
             "photo · pseudo depth": {"rgb": evaluation.photos, "depth": pseudo_views["depth"]},
             **{methods[method]: views for method, views in shown.items()},
         },
-        limit,
+        extent.limit,
         rows,
     )
     return results

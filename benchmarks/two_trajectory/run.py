@@ -32,9 +32,8 @@ import torch
 import tyro
 from numpy.typing import NDArray
 
-from unghost.core.results import build_results, commit
+from unghost.core.results import build_results, commit, json_ready
 from unghost.evaluation.captures.difficulty import difficulty_rows
-from unghost.evaluation.scoring.protocol import json_ready
 from unghost.fields.radiance import RadianceConfig, RadianceField
 from unghost.fields.rendering import render_view
 from unghost.fields.training import TrainingConfig, train_field

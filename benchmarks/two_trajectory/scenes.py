@@ -19,7 +19,7 @@ from unghost.data_recipes.harvest.labels import Truth as Labels
 from unghost.evaluation.captures.difficulty import every_nth
 from unghost.evaluation.captures.loading import load_capture
 from unghost.evaluation.scoring.conventions import SceneExtent
-from unghost.evaluation.scoring.protocol import ray_depth
+from unghost.evaluation.scoring.depths import ray_depth
 from unghost.evaluation.scoring.pseudo_truth import PseudoTruth, make_pseudo_truth
 from unghost.evaluation.scoring.views import Truth
 from unghost.fields.rendering import Sampling

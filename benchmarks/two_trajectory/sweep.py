@@ -22,8 +22,7 @@ import numpy as np
 import torch
 import tyro
 
-from unghost.core.results import build_results
-from unghost.evaluation.scoring.protocol import json_ready
+from unghost.core.results import build_results, json_ready
 
 from ..compact import write_lines
 from ..fit_cache import FitCache, say

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from unghost.core.metrics import get_metric
 from unghost.evaluation.scoring.curves import Curve
 from unghost.evaluation.scoring.intervals import bootstrap_scenes
 
@@ -41,7 +42,6 @@ KEYS = (
 )
 SECONDS = ("seconds", "cpu_seconds")  # of rows with the most threads
 AT_EQUAL = ("psnr", "ssim", "disparity_mae", "normal_mean_deg")
-LOWER_IS_BETTER = ("disparity_mae", "normal_mean_deg")
 FIXED = (0.3, 0.4, 0.5)
 FROM = 0.1  # coverage at which areas begin
 ORDERS = {"": "own", "_by_spread": "spread", "_by_photos": "photos", "_at_best": None}
@@ -160,7 +160,7 @@ def _curve(cell: Cell, order: str, key: str) -> Curve | None:
     ]
     if not rows:
         return None
-    return Curve.create(cell["method"], rows, metric=key, higher_is_better=key not in LOWER_IS_BETTER)
+    return Curve.create(cell["method"], rows, metric=key)
 
 
 def score_at(cells: Sequence[Cell], cell: Cell, key: str, coverage: float, order: str | None = "own") -> float | None:
@@ -175,7 +175,7 @@ def score_at(cells: Sequence[Cell], cell: Cell, key: str, coverage: float, order
         orders = ["own", "spread", "photos"]
     curves = [_curve(each, name, key) for each in same for name in orders if name is not None]
     found = [value for value in (curve.at(coverage) for curve in curves if curve is not None) if value is not None]
-    return (min if key in LOWER_IS_BETTER else max)(found, default=None)
+    return (min if get_metric(key).better == "lower" else max)(found, default=None)
 
 
 def compared(cells: Sequence[Cell]) -> list[Cell]:

@@ -45,7 +45,8 @@ def count_views(
 
     It is :meth:`Cameras.view_count` without depth: whoever cleans a field knows its cameras, not what was hidden
     from them. Along a side of a frustum everything is linear, so that a cube wholly within or beyond a side is
-    settled at once; on 32^3 voxels and pinholes this is some fifty times as fast.
+    settled at once. Planes, not :meth:`Cameras.project`: four cubes of 32^3 voxels against 100 pinholes take 20 ms
+    where projecting every voxel takes 540 ms (one core).
 
     Args:
         cameras: those of the photos, as the field was told.

@@ -17,7 +17,15 @@ NORMAL_THRESHOLD = 30.0  # degrees
 
 
 def depth_mse(preds: NDArray[Any], target: NDArray[Any], mask: Mask) -> float:
-    """Mean squared difference of two depth maps ``(H, W)``, in squared scene units; NaN for an empty mask."""
+    """Mean squared difference of two depth maps ``(H, W)``, in squared scene units; NaN for an empty mask.
+
+    Example:
+        >>> import numpy as np
+        >>> preds, target = np.array([[2.0, 4.0]]), np.array([[2.0, 5.0]])
+        >>> everywhere = np.ones((1, 2), dtype=bool)
+        >>> depth_mse(preds, target, everywhere)
+        0.5
+    """
     check_pair("depth_mse", preds, target, mask, channels=False)
     if not mask.any():
         return float("nan")
@@ -29,6 +37,13 @@ def disparity_mae(preds: NDArray[Any], target: NDArray[Any], mask: Mask) -> floa
 
     Raises:
         ValueError: also for an unmasked depth that is not > 0.
+
+    Example:
+        >>> import numpy as np
+        >>> preds, target = np.array([[2.0, 4.0]]), np.array([[2.0, 5.0]])
+        >>> everywhere = np.ones((1, 2), dtype=bool)
+        >>> round(disparity_mae(preds, target, everywhere), 6)
+        0.025
     """
     check_pair("disparity_mae", preds, target, mask, channels=False)
     if not mask.any():
@@ -43,6 +58,14 @@ def backproject(depth: NDArray[Any], cameras: Cameras, index: int) -> FloatArray
     """World positions ``(H, W, 3)`` of a depth map ``(H, W)``: origin + depth * unit direction, lens honoured.
 
     An infinite depth gives NaN: no position.
+
+    Example:
+        >>> import numpy as np
+        >>> from unghost.core import Cameras
+        >>> pose = np.eye(4)[None]  # looks along -Z
+        >>> cameras = Cameras.create(pose, np.array([4.0, 4.0, 1.5, 1.5]), width=3, height=3)
+        >>> (backproject(np.full((3, 3), 2.0), cameras, 0)[1, 1] + 0.0).tolist()
+        [0.0, 0.0, -2.0]
     """
     if depth.shape != (cameras.height, cameras.width):
         raise ValueError(f"backproject: depth must have shape {(cameras.height, cameras.width)}, got {depth.shape}")
@@ -57,6 +80,15 @@ def normals_from_depth(depth: NDArray[Any], cameras: Cameras, index: int) -> Flo
     The cross product of the differences between the right and left and the lower and upper neighbours'
     back-projections (one-sided at the image border). NaN where it or one of them has no finite depth, or where
     the product vanishes. Across a depth step the difference still counts, as in the paper's maps.
+
+    Example:
+        >>> import numpy as np
+        >>> from unghost.core import Cameras
+        >>> pose = np.eye(4)[None]  # looks along -Z
+        >>> cameras = Cameras.create(pose, np.array([4.0, 4.0, 1.5, 1.5]), width=3, height=3)
+        >>> wall = 2.0 / -cameras.rays(0)[1][..., 2]
+        >>> np.abs(normals_from_depth(wall, cameras, 0)[1, 1]).round(6).tolist()
+        [0.0, 0.0, 1.0]
     """
     positions = backproject(depth, cameras, index)
     if min(depth.shape) < 2:
@@ -76,6 +108,12 @@ def normal_errors(preds: NDArray[Any], target: NDArray[Any], mask: Mask) -> dict
     Returns:
         ``normal_mean_deg``, ``normal_median_deg`` and ``normal_pct_30``: the *share* in [0, 1] of
         pixels within 30 degrees, as the paper tabulates it. All NaN where no pixel is left.
+
+    Example:
+        >>> import numpy as np
+        >>> up, side = np.array([[[0.0, 0.0, 1.0]]]), np.array([[[1.0, 0.0, 0.0]]])
+        >>> normal_errors(up, side, np.ones((1, 1), dtype=bool))
+        {'normal_mean_deg': 90.0, 'normal_median_deg': 90.0, 'normal_pct_30': 0.0}
     """
     check_pair("normal_errors", preds, target, mask, channels=True)
     valid = mask & np.isfinite(preds).all(axis=-1) & np.isfinite(target).all(axis=-1)

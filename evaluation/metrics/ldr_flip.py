@@ -57,6 +57,14 @@ def flip(
 
     Returns:
         NaN for an empty mask.
+
+    Example:
+        >>> import numpy as np
+        >>> black, everywhere = np.zeros((4, 4, 3)), np.ones((4, 4), dtype=bool)
+        >>> flip(black, black, everywhere)
+        0.0
+        >>> round(flip(black + 1.0, black, everywhere), 2)
+        0.97
     """
     check_pair("flip", preds, target, mask, channels=True)
     if not mask.any():
@@ -71,6 +79,11 @@ def flip_map(preds: NDArray[Any], target: NDArray[Any], *, pixels_per_degree: fl
     Raises:
         ValueError: not two sRGB images of one shape with values in [0, 1] (within 1e-4, then clipped), or
             ``pixels_per_degree`` not finite and > 0.
+
+    Example:
+        >>> import numpy as np
+        >>> flip_map(np.zeros((4, 4, 3)), np.zeros((4, 4, 3))).max().item()
+        0.0
     """
     check_pair("flip_map", preds, target, np.ones(preds.shape[:2], dtype=bool), channels=True)
     if preds.shape[-1] != 3 or not preds.size:

@@ -13,7 +13,13 @@ MASK_KEYS = ("dice", "iou", "mask_precision", "mask_recall", "pixel_accuracy")
 
 
 def coverage(mask: Mask) -> float:
-    """Share of *all* pixels that a mask of any shape keeps; NaN for a mask without pixels."""
+    """Share of *all* pixels that a mask of any shape keeps; NaN for a mask without pixels.
+
+    Example:
+        >>> import numpy as np
+        >>> coverage(np.array([True, True, True, False]))
+        0.75
+    """
     if mask.dtype != np.bool_:
         raise ValueError(f"coverage: mask must be bool, got {mask.dtype}")
     return float(mask.mean()) if mask.size else float("nan")
@@ -32,6 +38,12 @@ def mask_scores(preds: Mask, target: Mask) -> dict[str, float]:
 
     Raises:
         ValueError: masks that are not bool, of different shapes, or without pixels.
+
+    Example:
+        >>> import numpy as np
+        >>> scores = mask_scores(np.array([True, True, False]), np.array([True, False, False]))
+        >>> scores["iou"], scores["mask_precision"], scores["mask_recall"]
+        (0.5, 0.5, 1.0)
     """
     for name, mask in (("preds", preds), ("target", target)):
         if mask.dtype != np.bool_:
@@ -53,6 +65,11 @@ def predicted_mask(accumulation: NDArray[Any], *, threshold: float) -> Mask:
 
     Raises:
         ValueError: a threshold outside (0, 1], or accumulations that are NaN or outside [0, 1] by more than 1e-3.
+
+    Example:
+        >>> import numpy as np
+        >>> predicted_mask(np.array([0.2, 0.98]), threshold=0.98).tolist()
+        [False, True]
     """
     if not 0 < threshold <= 1:
         raise ValueError(f"predicted_mask: threshold must lie in (0, 1], got {threshold}")

@@ -100,6 +100,13 @@ def lpips(
 
     Returns:
         NaN for an empty mask.
+
+    Example:
+        >>> import numpy as np
+        >>> squares = Lpips("squares", lambda first, second: ((first - second) ** 2).mean(axis=-1))
+        >>> target, everywhere = np.full((4, 4, 3), 0.5), np.ones((4, 4), dtype=bool)
+        >>> round(lpips(target + 0.1, target, everywhere, squares), 4)
+        0.01
     """
     check_pair("lpips", preds, target, mask, channels=True)
     blanked, over_mask = choose("lpips", "convention", convention, LPIPS_CONVENTIONS)

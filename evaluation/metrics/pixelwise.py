@@ -75,6 +75,16 @@ def psnr(
     Raises:
         ValueError: shapes, a mask that is not bool, ``data_range <= 0``, a NaN or infinity that is not masked out,
             an unknown convention.
+
+    Example:
+        >>> import numpy as np
+        >>> target = np.full((12, 12, 3), 0.5)
+        >>> half = np.arange(144).reshape(12, 12) < 72
+        >>> preds = np.where(half[..., None], target + 0.1, np.nan)
+        >>> round(psnr(preds, target, half, data_range=1.0), 6)
+        20.0
+        >>> round(psnr(preds, target, half, data_range=1.0, convention="all_pixels"), 2)
+        23.01
     """
     check_pair("psnr", preds, target, mask, channels=True)
     check_range("psnr", data_range)

@@ -75,6 +75,13 @@ def ssim(
     Raises:
         ValueError: shapes, a mask that is not bool, an unknown convention, a NaN or infinity that is looked at, an
             image too small for the convention's window.
+
+    Example:
+        >>> import numpy as np
+        >>> target = np.full((12, 12, 3), 0.5)
+        >>> everywhere = np.ones((12, 12), dtype=bool)
+        >>> round(ssim(target + 0.1, target, everywhere, data_range=1.0), 4)
+        0.9836
     """
     check_pair("ssim", preds, target, mask, channels=True)
     check_range("ssim", data_range)
@@ -94,6 +101,12 @@ def ssim_map(preds: NDArray[Any], target: NDArray[Any], *, data_range: float) ->
 
     Gaussian window 11 x 11 of standard deviation 1.5, ``k1 = .01``, ``k2 = .03``, biased covariances
     (Wang et al. 2004); images are mirrored at their edges, no border is cropped.
+
+    Example:
+        >>> import numpy as np
+        >>> image = np.full((12, 12, 3), 0.5)
+        >>> ssim_map(image, image, data_range=1.0).shape
+        (12, 12)
     """
     check_pair("ssim_map", preds, target, np.ones(preds.shape[:2], dtype=bool), channels=True)
     check_range("ssim_map", data_range)

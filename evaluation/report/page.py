@@ -13,13 +13,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ...core.metrics import METRICS
 from ..scoring.conventions import CONVENTIONS, PLAIN_CONVENTIONS
 from .charts import Series, colours_of, line_chart, swatch
 from .pictures import PHOTO, WORST, ViewPictures, wipe, worst_first
 from .style import SCRIPT, STYLE
 from .tables import (
     EQUAL_KEYS,
-    METRICS,
     OWN_KEYS,
     by_convention,
     convention_table,
@@ -263,7 +263,7 @@ def _views(results: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], pictur
 
 
 def _label(key: str) -> str:
-    return text(METRICS[key].label.removesuffix(", dB") if key in METRICS else key)
+    return text(METRICS[key].label.removesuffix(f", {METRICS[key].unit}") if key in METRICS else key)
 
 
 def _conventions(results: Mapping[str, Any]) -> str:

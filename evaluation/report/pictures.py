@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.metrics import get_metric
 from ..metrics.checks import Mask
 from ..scoring.renders import Method
 from ..scoring.views import Truth
-from .tables import METRICS, number, text
+from .tables import EQUAL_KEYS, OWN_KEYS, number, text
 
 LARGEST_SIDE = 1200  # pixels; larger pictures are shrunk for the page
 COARSE = 320  # pixels across; smaller ones are shown with their pixels as squares
@@ -51,14 +52,14 @@ def worst_first(images: Sequence[Mapping[str, Any]], key: str) -> list[str]:
     Raises:
         ValueError: a metric of which one cannot say which way is better.
     """
-    sortable = [each for each in METRICS if METRICS[each].better]
+    sortable = [each for each in (*OWN_KEYS, *EQUAL_KEYS) if get_metric(each).sign]
     if key not in sortable:
         raise ValueError(f"worst_first: key must be one of {', '.join(sortable)}, got {key!r}")
 
     def badness(row: Mapping[str, Any]) -> tuple[bool, float]:
         infinite = key in row.get("infinite", ())
         value = math.inf if infinite else row.get(key)
-        return (True, 0.0) if value is None else (False, value * METRICS[key].better)
+        return (True, 0.0) if value is None else (False, value * get_metric(key).sign)
 
     return [row["name"] for row in sorted(images, key=badness)]
 
@@ -155,8 +156,8 @@ def _caption(row: Mapping[str, Any], keys: Sequence[str]) -> str:
     if not row["pixels"]:
         return "no pixel counts"
     named = [
-        (METRICS[key], number(row.get(key), METRICS[key].digits, infinite=key in row["infinite"]))
+        (get_metric(key), number(row.get(key), get_metric(key).decimals, infinite=key in row["infinite"]))
         for key in keys
         if row.get(key) is not None or key in row["infinite"]
     ]
-    return " · ".join(f"{metric.label.removesuffix(', dB')} {shown}" for metric, shown in named)
+    return " · ".join(f"{metric.label.removesuffix(f', {metric.unit}')} {shown}" for metric, shown in named)

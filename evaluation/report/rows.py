@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.results import json_ready
 from ..scoring.conventions import get_convention, one_convention
-from ..scoring.protocol import json_ready
 
 TABLE_KEYS = (
     "psnr",
@@ -29,7 +29,7 @@ TABLE_KEYS = (
 def mean_over_seeds(method: str, per_seed: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """One results row: the mean of every number over the seeds, and each seed's own values under ``per_seed``.
 
-    A seed without a value (NaN) makes the mean None: half a mean is not comparable with a whole one.
+    A seed without a value (NaN or None) makes the mean None: half a mean is not comparable with a whole one.
 
     Args:
         method: the row's name.
@@ -49,7 +49,8 @@ def mean_over_seeds(method: str, per_seed: Sequence[Mapping[str, Any]]) -> dict[
         if key == "convention":
             row[key] = per_seed[0][key]
         elif key != "seed":
-            row[key] = float(np.mean([float(scores[key]) for scores in per_seed]))
+            values = [scores[key] for scores in per_seed]
+            row[key] = None if None in values else float(np.mean(values))
     row["per_seed"] = [{key: value for key, value in scores.items() if key != "convention"} for scores in per_seed]
     return dict(json_ready(row))
 

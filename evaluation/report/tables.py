@@ -5,58 +5,36 @@ from __future__ import annotations
 import html
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
+from ...core.metrics import METRICS, Metric
 from ..scoring.conventions import one_convention
 
-
-@dataclass(frozen=True)
-class Metric:
-    """How a number is shown.
-
-    Attributes:
-        label: heading.
-        better: 1 if higher is better, -1 if lower is, 0 if neither.
-        digits: after the point.
-    """
-
-    label: str
-    better: int
-    digits: int
-
-
-METRICS: Mapping[str, Metric] = {
-    "psnr": Metric("PSNR, dB", 1, 2),
-    "ssim": Metric("SSIM", 1, 3),
-    "lpips": Metric("LPIPS", -1, 3),
-    "flip": Metric("FLIP", -1, 3),
-    "depth_mse": Metric("depth MSE", -1, 3),
-    "disparity_mae": Metric("disparity MAE", -1, 3),
-    "normal_mean_deg": Metric("normals, mean °", -1, 1),
-    "normal_median_deg": Metric("normals, median °", -1, 1),
-    "normal_pct_30": Metric("normals within 30°", 1, 3),
-    "coverage": Metric("coverage", 0, 3),
-    "dice": Metric("Dice", 1, 3),
-    "mask_precision": Metric("of what is claimed, seen", 1, 3),
-    "mask_recall": Metric("of what was seen, claimed", 1, 3),
-    "psnr_common": Metric("PSNR on common pixels", 1, 2),
-    "coverage_common": Metric("coverage of those", 0, 3),
-    "psnr_visible": Metric("PSNR on visible pixels", 1, 2),
-    "psnr_at_coverage": Metric("PSNR at equal coverage", 1, 2),
-    "psnr_area": Metric("PSNR, mean over coverages", 1, 2),
-    "iou": Metric("IoU", 1, 3),
-    "iou_before": Metric("IoU before", 0, 3),
-    "iou_clean": Metric("IoU, untouched", 1, 3),
-    "floater_recall": Metric("ghosts removed", 1, 3),
-    "floater_precision": Metric("of the removed, ghosts", 1, 3),
-    "surface_kept": Metric("surface kept", 1, 3),
-    "free_space_error": Metric("free-space error", -1, 3),
-    "seconds": Metric("seconds", -1, 1),
-    "milliseconds": Metric("ms", -1, 1),
-    "megabytes": Metric("MB", -1, 2),
-}
-OWN_KEYS = tuple(key for key in METRICS if not key.startswith(("psnr_", "coverage_")))
+OWN_KEYS = (
+    "psnr",
+    "ssim",
+    "lpips",
+    "flip",
+    "depth_mse",
+    "disparity_mae",
+    "normal_mean_deg",
+    "normal_median_deg",
+    "normal_pct_30",
+    "coverage",
+    "dice",
+    "mask_precision",
+    "mask_recall",
+    "iou",
+    "iou_before",
+    "iou_clean",
+    "floater_recall",
+    "floater_precision",
+    "surface_kept",
+    "free_space_error",
+    "seconds",
+    "milliseconds",
+    "megabytes",
+)
 EQUAL_KEYS = ("psnr_common", "coverage_common", "psnr_visible", "psnr_at_coverage", "psnr_area")
 LABEL_KEYS = ("scene", "seed")
 ARROWS = {1: "\N{NO-BREAK SPACE}↑", -1: "\N{NO-BREAK SPACE}↓", 0: ""}
@@ -80,7 +58,7 @@ def number(value: Any, digits: int, *, infinite: bool = False) -> str:
 def heading(key: str, more: str = "") -> str:
     """A metric's label, what is to be said of it, and an arrow towards better."""
     known = METRICS.get(key)
-    return text(key + more) if known is None else text(known.label + more + ARROWS[known.better])
+    return text(key + more) if known is None else text(known.label + more + ARROWS[known.sign])
 
 
 def table(heads: Sequence[str], rows: Sequence[Sequence[str]], *, kind: str = "") -> str:
@@ -159,17 +137,17 @@ def difference_table(rows: Sequence[Mapping[str, Any]]) -> str:
     one_convention("difference_table", rows)
     cells = []
     for row in rows:
-        known = METRICS.get(row["metric"], Metric(row["metric"], 0, 3))
+        known = METRICS.get(row["metric"], Metric(row["metric"], row["metric"], "none"))
         low, high, mean = row["low"], row["high"], row["difference"]
         verdict = "one image" if low is None else "no difference shown"
         if low is not None and (low > 0 or high < 0):
-            verdict = ("better" if mean * known.better > 0 else "worse") if known.better else "differs"
-        interval = "–" if low is None else f"{_signed(low, known.digits)} … {_signed(high, known.digits)}"
+            verdict = ("better" if mean * known.sign > 0 else "worse") if known.sign else "differs"
+        interval = "–" if low is None else f"{_signed(low, known.decimals)} … {_signed(high, known.decimals)}"
         cells.append(
             [
                 f"{text(row['method'])} − {text(row['against'])}",
                 text(known.label),
-                _signed(mean, known.digits),
+                _signed(mean, known.decimals),
                 interval,
                 f'<span class="verdict {verdict.split()[0]}">{verdict}</span>',
                 str(row["images"]),
@@ -227,7 +205,7 @@ def _score(row: Mapping[str, Any], key: str) -> str:
 
 
 def _digits(key: str) -> int:
-    return METRICS[key].digits if key in METRICS else 3
+    return METRICS[key].decimals if key in METRICS else 3
 
 
 def _signed(value: float, digits: int) -> str:

@@ -19,15 +19,14 @@ if TYPE_CHECKING:
     from .conventions import get_convention as get_convention
     from .curves import Curve as Curve
     from .curves import cut_to_coverage as cut_to_coverage
+    from .depths import optical_depth as optical_depth
+    from .depths import ray_depth as ray_depth
     from .engine import SceneScores as SceneScores
     from .engine import score_scene as score_scene
     from .engine import score_under_all as score_under_all
     from .engine import summarize as summarize
     from .intervals import Interval as Interval
     from .intervals import bootstrap_scenes as bootstrap_scenes
-    from .protocol import json_ready as json_ready
-    from .protocol import optical_depth as optical_depth
-    from .protocol import ray_depth as ray_depth
     from .pseudo_truth import PseudoTruth as PseudoTruth
     from .pseudo_truth import check_cameras as check_cameras
     from .pseudo_truth import load_pseudo_truth as load_pseudo_truth
@@ -54,9 +53,9 @@ __getattr__, __dir__, __all__ = attach(
             "get_convention",
         ],
         ".curves": ["Curve", "cut_to_coverage"],
+        ".depths": ["optical_depth", "ray_depth"],
         ".engine": ["SceneScores", "score_scene", "score_under_all", "summarize"],
         ".intervals": ["Interval", "bootstrap_scenes"],
-        ".protocol": ["json_ready", "optical_depth", "ray_depth"],
         ".pseudo_truth": ["PseudoTruth", "check_cameras", "load_pseudo_truth", "make_pseudo_truth"],
         ".renders": ["Method", "match_names", "read_map", "read_masks", "read_method", "read_photos"],
         ".views": ["Renders", "Truth"],

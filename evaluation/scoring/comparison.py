@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.results import json_ready
 from ..metrics.checks import Mask
 from ..metrics.perceptual import Lpips
 from ..report.rows import convention_rows
@@ -23,7 +24,7 @@ from .conventions import (
 from .curves import Curve, against_points, compare, cut_to_coverage
 from .engine import SceneScores, score_scene, score_under_all, summarize
 from .intervals import RESAMPLES, bootstrap_difference
-from .protocol import common_mask, json_ready
+from .protocol import common_mask
 from .renders import Method
 from .views import Truth
 
@@ -206,15 +207,21 @@ def _knob(
     return rows
 
 
-def _equal_coverage(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Add the columns of :func:`compare` to the rows; give curves against points."""
-    curves = []
+def method_curves(rows: Sequence[Mapping[str, Any]]) -> dict[str, Curve]:
+    """PSNR over coverage of every method that has a finite one, from the rows of :func:`compare_methods`."""
+    curves = {}
     for row in rows:
         points = row.get("curve") or [row["point"]]
         known = [each for each in points if None not in (each.get("psnr"), each.get("coverage"))]
         if any(np.isfinite(each["psnr"]) for each in known):
             knob = "share_kept" if row.get("curve") else None
-            curves.append(Curve.create(row["method"], known, knob=knob))
+            curves[row["method"]] = Curve.create(row["method"], known, knob=knob)
+    return curves
+
+
+def _equal_coverage(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Add the columns of :func:`compare` to the rows; give curves against points."""
+    curves = list(method_curves(rows).values())
     if not curves:
         return []
     found = {each["method"]: each for each in compare(curves)}

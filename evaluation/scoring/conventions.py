@@ -17,7 +17,7 @@ import numpy as np
 from ...core.cameras import Cameras
 from ..metrics.checks import Mask, choose
 from ..metrics.masks import predicted_mask
-from .protocol import depth_limit
+from .protocol import depth_limit, depth_masks
 from .views import Renders, Truth
 
 IMAGE_KEYS = ("psnr", "ssim", "lpips")
@@ -234,7 +234,7 @@ def claimed_masks(convention: Convention, renders: Renders, truth: Truth, extent
     masks = np.ones(truth.photos.shape[:3], dtype=np.bool_)
     limit = None if extent is None else extent.depth_limit(convention)
     if limit is not None and renders.depth is not None:
-        masks &= renders.depth < limit
+        masks &= depth_masks(renders.depth, limit)
     if convention.accumulation is not None and renders.accumulation is not None:
         masks &= predicted_mask(renders.accumulation, threshold=convention.accumulation)
     return masks

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.metrics import get_metric
 from ..metrics.checks import Mask
 from .conventions import one_convention
 
@@ -58,7 +59,7 @@ class Curve:
         *,
         metric: str = "psnr",
         knob: str | None = None,
-        higher_is_better: bool = True,
+        higher_is_better: bool | None = None,
     ) -> Curve:
         """From results rows, one a setting of the knob, in any order.
 
@@ -67,11 +68,21 @@ class Curve:
             rows: each with ``coverage``, the metric, one common ``convention``, and the knob's value.
             metric: the rows' key.
             knob: the rows' key; None for a method without one.
-            higher_is_better: False for errors.
+            higher_is_better: of the metric; None for what the registry says (:mod:`unghost.core.metrics`).
 
         Raises:
             ValueError: rows of two conventions (both named), coverages outside [0, 1], or no row with a finite score.
+
+        Example:
+            >>> rows = [{"coverage": 0.4, "psnr": 20.0}, {"coverage": 0.8, "psnr": 18.0}]
+            >>> curve = Curve.create("ours", rows)
+            >>> round(curve.at(0.6), 6), curve.at(0.9)
+            (19.0, None)
+            >>> round(curve.area(0.4, 0.8), 6)
+            19.0
         """
+        if higher_is_better is None:
+            higher_is_better = get_metric(metric).better == "higher"
         convention = one_convention("Curve.create", rows)
         triples = [(row.get("coverage"), row.get(metric), np.nan if knob is None else row[knob]) for row in rows]
         known = [
@@ -123,7 +134,14 @@ class Curve:
 
 
 def common_range(curves: Sequence[Curve]) -> tuple[float, float] | None:
-    """Coverages that every curve reaches, points left aside; None where there are none."""
+    """Coverages that every curve reaches, points left aside; None where there are none.
+
+    Example:
+        >>> rows = [{"coverage": 0.4, "psnr": 20.0}, {"coverage": 0.8, "psnr": 18.0}]
+        >>> curve = Curve.create("ours", rows)
+        >>> common_range([curve, Curve.create("theirs", rows[:1])])  # a point reaches nothing
+        (0.4, 0.8)
+    """
     whole = [curve for curve in curves if not curve.is_point]
     if not whole:
         return None
@@ -146,6 +164,13 @@ def compare(curves: Sequence[Curve], *, coverage: float | None = None) -> list[d
 
     Raises:
         ValueError: two conventions or metrics (both named), two curves of one name, a coverage outside [0, 1].
+
+    Example:
+        >>> rows = [{"coverage": 0.4, "psnr": 20.0}, {"coverage": 0.8, "psnr": 18.0}]
+        >>> other = [{"coverage": 0.6, "psnr": 17.0}, {"coverage": 0.9, "psnr": 16.0}]
+        >>> curves = [Curve.create("ours", rows), Curve.create("theirs", other)]
+        >>> [(row["method"], round(row["psnr_at_coverage"], 2)) for row in compare(curves)]  # at .8
+        [('ours', 18.0), ('theirs', 16.33)]
     """
     _comparable("compare", curves)
     if coverage is not None and not 0 <= coverage <= 1:
@@ -176,6 +201,12 @@ def against_points(curves: Sequence[Curve]) -> list[dict[str, Any]]:
     Returns:
         Rows ``method``, ``point``, ``convention``, ``coverage``, ``<metric>`` of the curve and of the point
         (``<metric>_point``), and ``ahead``: by how much the curve is better, whichever way better is.
+
+    Example:
+        >>> rows = [{"coverage": 0.4, "psnr": 20.0}, {"coverage": 0.8, "psnr": 18.0}]
+        >>> curve, point = Curve.create("ours", rows), Curve.create("theirs", [{"coverage": 0.6, "psnr": 18.5}])
+        >>> round(against_points([curve, point])[0]["ahead"], 6)
+        0.5
     """
     _comparable("against_points", curves)
     rows: list[dict[str, Any]] = []
@@ -212,6 +243,11 @@ def cut_to_coverage(mask: Mask, confidence: NDArray[Any], *, coverage: float) ->
 
     Raises:
         ValueError: shapes, a mask that is not bool, a coverage outside [0, 1], a confidence that is NaN.
+
+    Example:
+        >>> mask, confidence = np.array([[True, True, True, False]]), np.array([[0.1, 0.9, 0.5, 1.0]])
+        >>> cut_to_coverage(mask, confidence, coverage=0.5).tolist()
+        [[False, True, True, False]]
     """
     if mask.dtype != np.bool_ or mask.shape != confidence.shape:
         raise ValueError(

@@ -114,6 +114,15 @@ def score_scene(
     Raises:
         ValueError: renders of another shape than the photos, a map missing that the masks or an asked metric need, a
             metric that the convention does not define.
+
+    Example:
+        >>> photos = np.full((2, 12, 12, 3), 0.5)
+        >>> visible = np.ones((2, 12, 12), dtype=bool)
+        >>> renders, truth = Renders(photos + 0.1), Truth(photos, visible)
+        >>> scores = score_scene(renders, truth, None, convention="visible_only", keys=["psnr", "coverage"])
+        >>> means = scores.means()
+        >>> round(means["psnr"], 6), means["coverage"], means["images_scored"]
+        (20.0, 1.0, 2)
     """
     rule = get_convention(convention)
     check_match("score_scene", renders, truth)

@@ -38,7 +38,13 @@ class Interval:
 
 
 def defined(values: Iterable[float | None]) -> tuple[FloatArray, int]:
-    """The values that are neither None nor NaN, and how many were."""
+    """The values that are neither None nor NaN, and how many were.
+
+    Example:
+        >>> values, undefined = defined([1.0, None, float("nan")])
+        >>> values.tolist(), undefined
+        ([1.0], 2)
+    """
     listed = list(values)
     known = np.array([value for value in listed if value is not None and not np.isnan(value)], dtype=np.float64)
     return known, len(listed) - len(known)
@@ -54,6 +60,11 @@ def bootstrap_mean(
         rng: draws ``resamples`` times ``(n,)`` indices, and nothing else.
         level: in (0, 1).
         resamples: >= 1.
+
+    Example:
+        >>> found = bootstrap_mean([18.0, 20.0, None], np.random.default_rng(0))
+        >>> found.mean, found.low, found.high, found.undefined
+        (19.0, 18.0, 20.0, 1)
     """
     _check("bootstrap_mean", level, resamples)
     known, undefined = defined(values)
@@ -84,6 +95,13 @@ def bootstrap_scenes(
         level: in (0, 1).
         resamples: >= 1.
         mean_over: ``"scenes"`` (mean of the scenes' means) or ``"images"`` (of all images).
+
+    Example:
+        >>> scenes = {"room": [18.0, 20.0], "hall": [30.0]}
+        >>> bootstrap_scenes(scenes, np.random.default_rng(0)).mean
+        24.5
+        >>> round(bootstrap_scenes(scenes, np.random.default_rng(0), mean_over="images").mean, 2)
+        22.67
     """
     _check("bootstrap_scenes", level, resamples)
     if mean_over not in ("scenes", "images"):
@@ -121,6 +139,11 @@ def bootstrap_difference(
 
     An image counts if both values are finite; the others are ``undefined``. Pairing takes out how hard an image is,
     so that the interval is far narrower than those of the two means.
+
+    Example:
+        >>> found = bootstrap_difference([18.0, 21.0], [17.0, 19.0], np.random.default_rng(0))
+        >>> found.mean, found.low, found.high
+        (1.5, 1.0, 2.0)
     """
     _check("bootstrap_difference", level, resamples)
     if len(first) != len(second):

@@ -3,6 +3,7 @@ import os
 import re
 import subprocess
 
+import numpy as np
 import pytest
 
 from unghost.core import results
@@ -73,3 +74,8 @@ def test_results_do_not_make_the_checkout_dirty_but_code_does(tmp_path, monkeypa
     assert results.commit() == clean
     (tmp_path / "core" / "results.py").write_text("2")
     assert results.commit() == f"{clean}-dirty"
+
+
+def test_json_ready_turns_what_json_lacks_into_null():
+    nested = {"a": float("nan"), "b": [np.float32(1.5), float("inf")], "c": (np.int64(2), "text", None, True)}
+    assert results.json_ready(nested) == {"a": None, "b": [1.5, None], "c": [2, "text", None, True]}

@@ -115,3 +115,18 @@ def test_import_is_light():
         check=True,
     )
     assert done.stdout.strip() == "[]"
+
+
+def test_arrays_are_scored_on_the_base_install():
+    done = run(
+        """
+        import numpy as np
+        from unghost.evaluation import Renders, Truth, evaluate
+
+        photos = np.full((2, 8, 8, 3), 0.5)
+        results = evaluate({"a": Renders(photos + 0.1)}, Truth(photos), resamples=10)
+        assert abs(results.scores["a"]["psnr"] - 20) < 1e-9
+        results.table()
+        """
+    )
+    assert done.returncode == 0, done.stderr

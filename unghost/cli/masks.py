@@ -61,7 +61,7 @@ def masks(
     from PIL import Image
 
     from ..evaluation.captures.loading import load_capture
-    from ..evaluation.scoring.protocol import ray_depth
+    from ..evaluation.scoring.depths import ray_depth
     from ..evaluation.scoring.pseudo_truth import make_pseudo_truth
 
     posed = load_capture(capture, downscale=downscale, normalize=normalize)

@@ -46,7 +46,7 @@ def doubt(
 
     from ..evaluation.captures.loading import load_capture
     from ..evaluation.captures.splits import EVAL_NAMES, TRAIN_NAMES, choose_split
-    from ..evaluation.scoring.protocol import ray_depth
+    from ..evaluation.scoring.depths import ray_depth
     from ..evaluation.scoring.renders import read_map, read_method
     from ..evaluation.uncertainty.photometric import UNSEEN, photo_doubt
 

@@ -9,6 +9,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ..core.metrics import get_metric
+from .run import SCORES
+
 STYLE = """
 :root { color-scheme: light; --ink: #23252b; --soft: #6b6d75; --line: #ddd6cb; --accent: #d9720b; }
 * { box-sizing: border-box; }
@@ -38,14 +41,7 @@ th:first-child, td:first-child { text-align: left; }
 code { background: #ece7de; padding: 1px 5px; border-radius: 4px; }
 """
 NAMES = {"clean": "unghost clean", "components": "largest component"}
-COLUMNS = {
-    "floater_recall": "ghosts removed",
-    "floater_precision": "of the removed, ghosts",
-    "surface_kept": "surface kept",
-    "iou_before": "IoU before",
-    "iou": "IoU after",
-    "seconds": "seconds",
-}
+COLUMNS = {key: get_metric(key).label for key in SCORES} | {"iou": "IoU after"}
 
 
 def _image(png: bytes, alt: str) -> str:

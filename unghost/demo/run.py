@@ -24,6 +24,7 @@ from ..scenes.labelled_room.room import AABB, SHAPE, Room, build_room
 
 Mask = NDArray[np.bool_]
 RULE = OccupancyRule()
+SCORES = ("floater_recall", "floater_precision", "surface_kept", "iou_before", "iou", "seconds")  # in the tables
 
 
 @dataclass(frozen=True)
@@ -136,10 +137,9 @@ def run_demo(out: str | Path, *, seed: int = 0, denoiser: Any = None) -> dict[st
 
 def summary_table(results: Mapping[str, Any]) -> str:
     """The rows of a demo's results as a few lines of plain text."""
-    columns = ("floater_recall", "floater_precision", "surface_kept", "iou_before", "iou", "seconds")
-    lines = [f"{'':12}" + "".join(f"{name:>19}" for name in columns)]
+    lines = [f"{'':12}" + "".join(f"{name:>19}" for name in SCORES)]
     for row in results["rows"]:
-        cells = ["-" if row[name] is None else f"{row[name]:.3f}" for name in columns]
+        cells = ["-" if row[name] is None else f"{row[name]:.3f}" for name in SCORES]
         lines.append(f"{row['method']:12}" + "".join(f"{cell:>19}" for cell in cells))
     lines.append("ghosts removed by kind: ")
     for row in results["rows"]:

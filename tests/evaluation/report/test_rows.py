@@ -25,6 +25,7 @@ def test_a_seed_without_a_number_leaves_no_mean():
     row = report.mean_over_seeds("field", [A, {**B, "psnr": float("nan")}])
     assert row["psnr"] is None
     assert row["per_seed"][1]["psnr"] is None
+    assert report.mean_over_seeds("field", [A, {**B, "psnr": None}]) == row
     assert row["coverage"] == pytest.approx(0.85)
 
 

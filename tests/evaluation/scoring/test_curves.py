@@ -163,3 +163,14 @@ def test_cutting_errors():
         curves.cut_to_coverage(mask, np.ones((2, 2)), coverage=50)
     with pytest.raises(ValueError, match="4 confidences in the mask are NaN"):
         curves.cut_to_coverage(mask, np.full((2, 2), np.nan), coverage=0.5)
+
+
+def test_the_direction_of_a_metric_is_that_of_the_registry():
+    rows = [{"coverage": 0.5, "disparity_mae": value, "convention": "proper"} for value in (0.3, 0.2)]
+    curve = Curve.create("a", rows, metric="disparity_mae")
+    assert not curve.higher_is_better
+    assert curve.score.tolist() == [0.2]  # of one coverage the better counts
+    other = [{**row, "own": row["disparity_mae"]} for row in rows]
+    with pytest.raises(ValueError, match=r"key must be one of psnr, .* got 'own'"):
+        Curve.create("a", other, metric="own")
+    assert Curve.create("a", other, metric="own", higher_is_better=True).score.tolist() == [0.3]

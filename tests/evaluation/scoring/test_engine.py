@@ -7,7 +7,8 @@ from unghost.core.cameras import Cameras
 from unghost.evaluation.metrics import pixelwise as metrics
 from unghost.evaluation.metrics.perceptual import Lpips
 from unghost.evaluation.scoring import engine as scoring
-from unghost.evaluation.scoring.conventions import CONVENTIONS, DEPTH_KEYS, NORMAL_KEYS, SceneExtent
+from unghost.evaluation.scoring.conventions import CONVENTIONS, DEPTH_KEYS, NORMAL_KEYS, SceneExtent, evaluation_masks
+from unghost.evaluation.scoring.protocol import common_mask, visibility_masks
 from unghost.evaluation.scoring.views import Renders, Truth
 
 SIZE = (16, 20)
@@ -281,3 +282,87 @@ def test_flip_stands_in_the_proper_column():
     row = scoring.score_scene(renders, truth, EXTENT, convention="proper").images[0]
     mask = truth.visible[0] & (renders.depth[0] < 6)
     assert row["flip"] == metrics.flip(renders.colours[0], truth.photos[0], mask)
+
+
+WALL, WALL_LIMIT = 4.0, SceneExtent(limit=6.0, unit=1.5)
+
+
+def _wall():
+    """Photos of noise, the depth of a wall along unit rays, and what cameras at x = 0 and 1 saw of it."""
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[:, 0, 3] = 0.5, 3.0
+    lens = np.array([20.0, 20.0, SIZE[1] / 2, SIZE[0] / 2])
+    cameras = Cameras.create(poses, lens, SIZE[1], SIZE[0])
+    poses[:, 0, 3] = 0.0, 1.0
+    depth = np.stack([-WALL / cameras.rays(index)[1][..., 2] for index in range(2)])
+    visible = visibility_masks(cameras, depth, Cameras.create(poses, lens, SIZE[1], SIZE[0]))
+    photos = np.random.default_rng(0).random((2, *SIZE, 3))
+    return Truth(photos, visible, depth, cameras=cameras)
+
+
+@pytest.mark.parametrize("convention", ["paper_text", "proper"])
+def test_a_perfect_rendering_of_a_wall_scores_perfectly(convention):
+    truth = _wall()
+    found = scoring.score_scene(Renders(truth.photos, truth.depth), truth, WALL_LIMIT, convention=convention).means()
+    assert found["psnr"] == float("inf")
+    assert found["ssim"] == pytest.approx(1)
+    assert found["depth_mse"] == found["disparity_mae"] == 0
+    assert found["normal_mean_deg"] == pytest.approx(0, abs=1e-4)
+    assert found["normal_pct_30"] == 1
+    assert found["coverage"] == pytest.approx((truth.visible & (truth.depth < WALL_LIMIT.limit)).mean())
+    assert found["images_scored"] == 2
+    assert found["convention"] == convention
+
+
+@pytest.mark.parametrize("convention", ["paper_text", "proper"])
+def test_scores_are_means_over_views_of_the_metrics(convention):
+    truth = _wall()
+    depth = truth.depth * 1.1
+    colours = np.clip(truth.photos + np.reshape([0.1, -0.2], (2, 1, 1, 1)), 0, 1)
+    found = scoring.score_scene(Renders(colours, depth), truth, WALL_LIMIT, convention=convention).means()
+    masks = truth.visible & (depth < WALL_LIMIT.limit)
+    parts = [metrics.psnr(colours[i], truth.photos[i], masks[i], data_range=1.0) for i in range(2)]
+    assert found["psnr"] == pytest.approx(np.mean(parts))
+    errors = [np.mean((0.1 * truth.depth[i][masks[i]]) ** 2) for i in range(2)]
+    assert found["depth_mse"] == pytest.approx(np.mean(errors))
+    assert set(found) == {"convention", "images", "images_scored", *CONVENTIONS[convention].keys}
+
+
+@pytest.mark.parametrize("convention", ["paper_text", "proper"])
+def test_removing_everything_gives_no_coverage_and_no_number(convention):
+    truth = _wall()
+    gone = Renders(np.zeros_like(truth.photos), np.full_like(truth.depth, np.inf))
+    found = scoring.score_scene(gone, truth, WALL_LIMIT, convention=convention).means()
+    assert (found["coverage"], found["images_scored"]) == (0, 0)
+    assert all(found[key] is None for key in ("psnr", "ssim", *DEPTH_KEYS, "normal_mean_deg"))
+    visible = scoring.score_scene(gone, truth, None, convention="visible_only", keys=["psnr"]).means()
+    assert np.isfinite(visible["psnr"])  # black where the photo is not: removal is not free there
+
+
+def test_clipped_pseudo_depth_leaves_no_error_above_the_limit():
+    truth = _wall()
+    endless = dataclasses.replace(truth, depth=np.full_like(truth.depth, 1e4))
+    renders = Renders(truth.photos, truth.depth)
+    clipped = scoring.score_scene(renders, endless, WALL_LIMIT, convention="proper").means()
+    assert 0 < clipped["depth_mse"] < WALL_LIMIT.limit**2
+    assert clipped["normal_mean_deg"] is None  # no surface to compare with
+    unclipped = scoring.score_scene(renders, endless, WALL_LIMIT, convention="paper_text").means()
+    assert unclipped["depth_mse"] > 0.99e8
+
+
+def test_common_pixels_make_methods_comparable():
+    truth = _wall()
+    colours = np.clip(truth.photos + 0.1, 0, 1)
+    holed = truth.depth.copy()
+    holed[:, :, :10] = np.inf
+    renders = [Renders(colours, each) for each in (truth.depth, holed)]
+    rule = CONVENTIONS["paper_text"]
+    shared = common_mask([evaluation_masks(rule, each, truth, WALL_LIMIT) for each in renders])
+    own, common = (
+        [scoring.score_scene(each, truth, WALL_LIMIT, convention="paper_text", within=mask).means() for each in renders]
+        for mask in (None, shared)
+    )
+    assert own[0]["psnr"] != own[1]["psnr"]
+    assert common[0]["psnr"] == common[1]["psnr"] == pytest.approx(own[1]["psnr"])
+    assert common[0]["coverage"] == pytest.approx(own[1]["coverage"])
+    assert own[1]["coverage"] < own[0]["coverage"]

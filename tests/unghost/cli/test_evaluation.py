@@ -142,7 +142,7 @@ def test_without_a_sweep_called_eval_it_is_the_usual_other_name(renders, capture
     assert results(renders / "out")["evaluation"]["views"] == 3
     (capture / "splits.json").write_text(json.dumps({"walk": sweeps["train"], "back": sweeps["eval"]}))
     assert run(renders / "a", "--gt", capture, "--out", renders / "new") == 2
-    assert "--eval-split must say which sweep is meant; the capture has walk, back" in capsys.readouterr().err
+    assert "eval_split must say which sweep is meant; the capture has walk, back" in capsys.readouterr().err
     assert run(renders / "a", "--gt", capture, "--eval-split", "back", "--out", renders / "new") == 0
     assert "No depth limit is known: the capture has no sweep called train" in capsys.readouterr().out
     words = ["--eval-split", "back", "--train-split", "run"]
@@ -160,7 +160,7 @@ def test_views_are_sorted_by_a_metric_that_is_computed(renders, capture):
 def test_a_sort_that_is_not_computed_is_refused_before_a_picture_is_read(renders, capture, capsys):
     words = [renders / "absent", "--gt", capture, "--metrics", "ssim", "--sort", "flip", "--out", renders / "out"]
     assert run(*words) == 2
-    assert "--sort flip must be one of --metrics ssim" in capsys.readouterr().err
+    assert "sort must be one of the metrics ssim, got 'flip'" in capsys.readouterr().err
 
 
 def test_normals_that_are_no_directions_are_refused(renders, capture, capsys):
@@ -215,8 +215,9 @@ def test_two_identical_trajectories_are_scored(renders, capture, capsys):
 
 @pytest.mark.parametrize("words", [("--min-views", "3"), ("--occlusion", "False")])
 def test_options_of_masks_npz_are_refused_without_it(renders, capture, masks, capsys, words):
+    option = words[0].removeprefix("--").replace("-", "_")
     assert run(renders / "a", "--gt", capture, "--no-normalize", *words, "--out", renders / "out") == 2
-    assert f"{words[0]} needs --masks masks.npz (of unghost masks), got no masks" in capsys.readouterr().err
+    assert f"{option} needs masks.npz (of unghost masks) as masks, got no masks" in capsys.readouterr().err
     words = (*words, "--masks", masks)
     assert run(renders / "a", "--gt", capture, "--no-normalize", *words, "--out", renders / "out") == 2
     assert f"got the pictures in {masks}" in capsys.readouterr().err

@@ -1,0 +1,28 @@
+"""Depth along a pixel's unit ray, and depth along the camera's optical axis."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core.cameras import Cameras
+
+
+def optical_depth(depth: NDArray[Any], cameras: Cameras) -> NDArray[np.float64]:
+    """Distance along unit rays ``(n, H, W)`` to depth along the optical axis: times the cosine."""
+    return np.asarray(depth, dtype=np.float64) * _cosines("optical_depth", depth, cameras)
+
+
+def ray_depth(depth: NDArray[Any], cameras: Cameras) -> NDArray[np.float64]:
+    """Inverse of :func:`optical_depth`."""
+    return np.asarray(depth, dtype=np.float64) / _cosines("ray_depth", depth, cameras)
+
+
+def _cosines(caller: str, depth: NDArray[Any], cameras: Cameras) -> NDArray[np.float64]:
+    """Of each pixel's ray with the optical axis ``(n, H, W)``."""
+    shape = (len(cameras), cameras.height, cameras.width)
+    if np.shape(depth) != shape:
+        raise ValueError(f"{caller}: depth must have shape {shape}, got {np.shape(depth)}")
+    return np.stack([cameras.rays(index)[1] @ -cameras.camera_to_world[index, :, 2] for index in range(len(cameras))])
