@@ -61,7 +61,7 @@ _FACET = re.compile(
 def _numbers(words: list[str], number: int) -> list[float]:
     """Three coordinates of line ``number``."""
     try:
-        if len(words) < 3 or any("_" in word for word in words[:3]):
+        if len(words) < 3 or "_" in "".join(words[:3]):
             raise ValueError
         return [float(word) for word in words[:3]]
     except ValueError:
