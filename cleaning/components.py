@@ -1,4 +1,12 @@
-"""Connected components of a voxel grid in plain numpy: the base install has no scipy."""
+"""Connected components of a voxel grid, by scipy where it is installed, and dilation.
+
+The base install has no scipy, so ``label_components`` has a fallback in numpy with the same labels. Measured on one
+core, grids with about a tenth of the cells occupied, from random cells to thick shells: ``scipy.ndimage.label`` is 1.6
+to 9 times as fast at 64^3 and 2 to 11 times at 128^3 (12 ms instead of 129 ms for a shell among specks).
+
+``dilate`` is written in numpy on purpose: six shifted ORs take 0.8 ms at 128^3, ``scipy.ndimage.binary_dilation``
+25 to 30 ms, ``maximum_filter`` 27 to 40 ms.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +18,8 @@ from numpy.typing import NDArray
 Mask = NDArray[np.bool_]
 
 
-def neighbour_steps(connectivity: int) -> list[tuple[int, int, int]]:
+def _neighbour_steps(connectivity: int) -> list[tuple[int, int, int]]:
     """Half of the neighbours of a voxel (the other half are their opposites): 3 for 6, 13 for 26."""
-    if connectivity not in (6, 26):
-        raise ValueError(f"neighbour_steps: connectivity must be 6 or 26, got {connectivity}")
     span = (-1, 0, 1)
     steps = [(x, y, z) for x, y, z in itertools.product(span, span, span) if (x, y, z) > (0, 0, 0)]
     return [step for step in steps if connectivity == 26 or sum(map(abs, step)) == 1]
@@ -28,14 +34,31 @@ def label_components(occupied: Mask, *, connectivity: int = 26) -> tuple[NDArray
 
     Returns:
         labels ``(X, Y, Z)``: 0 where empty, else 1 … count, in the order of each component's first voxel
-        (C order, as scipy's); and the count.
+        (C order); and the count.
+
+    Raises:
+        ValueError: another connectivity.
     """
+    if connectivity not in (6, 26):
+        raise ValueError(f"label_components: connectivity must be 6 or 26, got {connectivity}")
+    try:
+        from scipy import ndimage
+    except ImportError:
+        return _label_in_numpy(occupied, connectivity)
+    structure = ndimage.generate_binary_structure(3, 1 if connectivity == 6 else 3)
+    cells = np.ascontiguousarray(occupied)  # scipy numbers along the axis of the smallest stride
+    labels, count = ndimage.label(cells, structure, output=np.int64)
+    return labels, int(count)
+
+
+def _label_in_numpy(occupied: Mask, connectivity: int) -> tuple[NDArray[np.int64], int]:
+    """The same labels without scipy."""
     padded = np.pad(occupied, 1)  # so that a step never leaves the grid
     cells = np.flatnonzero(padded)
     number = np.full(padded.size, -1, dtype=np.int64)
     number[cells] = np.arange(cells.size)
     edges = []
-    for step in neighbour_steps(connectivity):
+    for step in _neighbour_steps(connectivity):
         other = number[cells + int(np.dot(step, [padded.shape[1] * padded.shape[2], padded.shape[2], 1]))]
         touching = np.flatnonzero(other >= 0)
         edges.append(np.stack([touching, other[touching]]))

@@ -18,7 +18,6 @@ paper's ablation, ``--every-eighth`` scores every 8th photo of the first sweep. 
 from __future__ import annotations
 
 import dataclasses
-import fcntl
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -30,6 +29,7 @@ from typing import Any
 import numpy as np
 import torch
 import tyro
+from filelock import FileLock
 from numpy.typing import NDArray
 
 from unghost.core.results import build_results, commit, json_ready
@@ -143,8 +143,7 @@ class Ledger:
     def alone(self) -> Iterator[None]:
         """One process at a time, with the file as the last one left it."""
         self.options.cache.mkdir(parents=True, exist_ok=True)
-        with open(self.options.cache / "ledger.lock", "w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
+        with FileLock(self.options.cache / "ledger.lock"):
             self.read()
             yield
 

@@ -2,7 +2,8 @@
 
 trimesh leaves out, without a word, each geometry whose material or source it cannot resolve. So materials, images,
 effects, cameras, lights and animations are removed first, and the triangles that the scene must have are counted
-on the way. Needs ``pycollada`` (``pip install unghost[recipes]``).
+on the way. Of the 26 files of the hostile and the ordinary mesh sets, trimesh (5.2.0) alone gives nothing for 3 that
+have triangles. Needs ``pycollada`` (``pip install unghost[recipes]``).
 """
 
 from __future__ import annotations

@@ -3,6 +3,11 @@
 What trimesh is given is a new, minimal scene: the default scene's nodes, their meshes' positions and indices, and
 the bytes these name. Images, materials, skins, animations and morph targets never reach it: the geometry is the
 one at rest, as stored, under its nodes' transforms.
+
+Checked here, because trimesh (5.2.0) alone, on the 146 glTF and GLB files of the hostile set, calls 10 files empty that
+are broken or made of what it does not read (triangle fans, required extensions), and fails on 40 sound files without a
+triangle (mostly with a KeyError or an UnboundLocalError). Of the 731 files of the ordinary set it makes the same
+triangles.
 """
 
 from __future__ import annotations

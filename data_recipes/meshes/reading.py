@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 
 _MARKS = ((b"\xef\xbb\xbf", "utf-8-sig"), (b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16"))
-MOST_CORNERS = 2000  # of a concave polygon
+MOST_CORNERS = 20_000  # of a concave polygon: cut in less than a second, or in some seconds if it crosses itself
 _FLATTEST = 1e-9  # smallest singular value over the largest of a node's transform
 
 
@@ -51,7 +51,9 @@ def decode_text(data: bytes) -> str:
 
 
 def triangulate(vertices: Array, counts: Array, corners: Array) -> Array:
-    """Cut polygons into triangles: a fan where that is right, ears where the polygon is concave.
+    """Cut polygons into triangles: a fan where that is right, along inner diagonals where the polygon is concave.
+
+    Concave quads are cut here, other concave polygons by ``mapbox_earcut``; a polygon that crosses itself is a fan.
 
     Args:
         vertices: ``(V, 3)``.
@@ -82,60 +84,72 @@ def _cut(vertices: Array, counts: Array, corners: Array) -> Array:
     for n in np.unique(counts):
         rows = np.flatnonzero(counts == n)
         rings = vertices[corners[starts[rows][:, None] + np.arange(n)]]
-        fans = np.stack([np.stack([rings[:, 0], rings[:, i], rings[:, i + 1]], axis=1) for i in range(1, n - 1)], 1)
-        for row in _concave(fans) if n > 3 else ():
-            fans[row] = _clip_ears(rings[row], fans[row])
+        fans = np.stack([rings[:, :1].repeat(n - 2, axis=1), rings[:, 1:-1], rings[:, 2:]], axis=2)
+        concave = np.flatnonzero(_concave(fans))
+        if n == 4:
+            other = rings[concave][:, [[1, 2, 3], [1, 3, 0]]]  # cut along the other diagonal
+            right = ~_concave(other)
+            fans[concave[right]] = other[right]
+        elif len(concave):
+            triangles, polygons = _cut_concave(rings[concave])
+            pieces.append(triangles)
+            owners.append(rows[concave[polygons]])
+            rows, fans = np.delete(rows, concave), np.delete(fans, concave, axis=0)
         pieces.append(fans.reshape(-1, 3, 3))
         owners.append(np.repeat(rows, n - 2))
     return np.concatenate(pieces)[np.argsort(np.concatenate(owners), kind="stable")]
 
 
 def _concave(fans: Array) -> Array:
-    """Numbers of the polygons ``(P, n - 2, 3, 3)`` with a fan triangle turned against the whole."""
+    """Which of the polygons, cut into triangles ``(P, n - 2, 3, 3)``, have one that is turned against the whole."""
     fans = fans - fans[:, :1, :1]
     fans = fans / np.maximum(np.abs(fans).max(axis=(1, 2, 3), keepdims=True), 1e-300)
     normals = np.cross(fans[:, :, 1] - fans[:, :, 0], fans[:, :, 2] - fans[:, :, 0])
     whole = normals.sum(axis=1, keepdims=True)
-    turned = (normals * whole).sum(axis=2) < -1e-9 * (whole**2).sum(axis=2)
-    rows: Array = np.flatnonzero(turned.any(axis=1))
-    return rows
+    turned: Array = ((normals * whole).sum(axis=2) < -1e-9 * (whole**2).sum(axis=2)).any(axis=1)
+    return turned
 
 
-def _clip_ears(ring: Array, fan: Array) -> Array:
-    """Triangles ``(n - 2, 3, 3)`` of a concave polygon ``(n, 3)``; its fan where no cut is right (it meets itself)."""
-    if len(ring) > MOST_CORNERS:
-        raise MeshRejected(f"a concave polygon of {len(ring)} corners, more than {MOST_CORNERS}")
-    moved = ring - ring[0]
-    normal = np.cross(moved, np.roll(moved, -1, axis=0)).sum(axis=0)
-    flat = np.delete(moved, int(np.abs(normal).argmax()), axis=1)
-    x, y = flat[:, 0], flat[:, 1]
-    if (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() < 0:
-        flat = flat * [1, -1]
-    left, ears = list(range(len(ring))), []
-    while len(left) > 3:
-        ear = next((i for i in range(len(left)) if _is_ear(flat, left, i)), None)
-        if ear is None:
-            return fan
-        ears.append([left[ear - 1], left[ear], left[(ear + 1) % len(left)]])
-        del left[ear]
-    triangles: Array = ring[np.array([*ears, left])]
-    return triangles
+def _cut_concave(rings: Array) -> tuple[Array, Array]:
+    """Cut concave polygons ``(P, n, 3)`` along diagonals inside them, in the coordinate plane that each faces most.
+
+    Returns:
+        Triangles ``(F, 3, 3)``, turned as their polygons, and the number ``(F,)`` of each one's polygon. Corners on a
+        straight line may be left out. A polygon that crosses itself is a fan: no cut covers its area once.
+    """
+    n = rings.shape[1]
+    if n > MOST_CORNERS:
+        raise MeshRejected(f"a concave polygon of {n} corners, more than {MOST_CORNERS}")
+    try:
+        from mapbox_earcut import triangulate_float64
+    except ImportError as error:
+        raise ImportError("triangulate: concave polygons need mapbox_earcut: pip install unghost[recipes]") from error
+    moved = rings - rings[:, :1]
+    moved = np.ldexp(moved, -np.frexp(np.abs(moved).max(axis=(1, 2), keepdims=True))[1])  # at most 1, without rounding
+    normal = np.cross(moved, np.roll(moved, -1, axis=1)).sum(axis=1)
+    plane = np.array([[1, 2], [2, 0], [0, 1]])[np.abs(normal).argmax(axis=1)]
+    flat = np.take_along_axis(moved, plane[:, None, :], axis=2)
+    areas = _signed_areas(flat[:, :1], flat[:, 1:-1], flat[:, 2:]).sum(axis=1)
+    ends = np.array([n], dtype=np.uint32)
+    cuts = [triangulate_float64(ring, ends).reshape(-1, 3).astype(np.int64) for ring in flat]
+    index, owner = np.concatenate(cuts), np.repeat(np.arange(len(cuts)), [len(cut) for cut in cuts])
+    parts = _signed_areas(*np.moveaxis(flat[owner[:, None], index], 1, 0))
+    covered = np.bincount(owner, np.abs(parts), minlength=len(cuts))
+    right = np.abs(covered - np.abs(areas)) <= 1e-9 * np.abs(areas) + 1e-12
+    index = np.where((parts * areas[owner] < 0)[:, None], index[:, ::-1], index)
+    crossed, fan = (
+        np.flatnonzero(~right),
+        np.stack([np.zeros(n - 2, int), np.arange(1, n - 1), np.arange(2, n)], axis=1),
+    )
+    index = np.concatenate([index[right[owner]], np.tile(fan, (len(crossed), 1))])
+    owner = np.concatenate([owner[right[owner]], np.repeat(crossed, n - 2)])
+    return rings[owner[:, None], index], owner
 
 
-def _is_ear(flat: Array, left: list[int], i: int) -> bool:
-    """Whether corner ``i`` of the remaining counter-clockwise ring can go: convex, and no other in its triangle."""
-    a, b, c = (flat[left[j % len(left)]] for j in (i - 1, i, i + 1))
-
-    def side(p: Array, q: Array, r: Array) -> Array:
-        area: Array = (q[0] - p[0]) * (r[..., 1] - p[1]) - (q[1] - p[1]) * (r[..., 0] - p[0])
-        return area
-
-    if side(a, b, c) <= 0:  # a straight corner adds no area
-        return bool(side(a, b, c) == 0 and np.dot(b - a, c - b) >= 0)
-    others = flat[left]
-    at_corner = (others == a).all(axis=1) | (others == b).all(axis=1) | (others == c).all(axis=1)
-    inside = (side(a, b, others) >= 0) & (side(b, c, others) >= 0) & (side(c, a, others) >= 0) & ~at_corner
-    return not bool(inside.any())
+def _signed_areas(a: Array, b: Array, c: Array) -> Array:
+    """Signed areas ``(...)`` of triangles with corners ``(..., 2)``."""
+    area: Array = ((b - a)[..., 0] * (c - a)[..., 1] - (b - a)[..., 1] * (c - a)[..., 0]) / 2
+    return area
 
 
 def trimesh_triangles(data: bytes, file_type: str, sides: dict[str, bytes] | None = None) -> Array:

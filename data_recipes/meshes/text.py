@@ -2,6 +2,11 @@
 
 A general reader skips what it does not understand, and a mesh with a wrong index, a missing coordinate or half of
 its lines comes out as some other mesh. These formats are short enough to be read whole.
+
+Written here, because trimesh (5.2.0) alone, on the 45 OBJ and 13 STL files of the hostile set, makes a mesh of 3 OBJ
+files that are not sound (faces of two corners, NUL characters), fails on 2 that are (a byte order mark, old line ends),
+calls 2 files that are no OBJ empty, and calls 4 STL files that are cut short or no STL empty. On the 216 OBJ and 8 STL
+files of the ordinary set the two agree.
 """
 
 from __future__ import annotations
@@ -61,7 +66,7 @@ _FACET = re.compile(
 def _numbers(words: list[str], number: int) -> list[float]:
     """Three coordinates of line ``number``."""
     try:
-        if len(words) < 3 or any("_" in word for word in words[:3]):
+        if len(words) < 3 or "_" in "".join(words[:3]):
             raise ValueError
         return [float(word) for word in words[:3]]
     except ValueError:

@@ -1,6 +1,10 @@
 """Structural similarity (Wang et al. 2004) under a mask, in the five ways that are in use, each with a name.
 
 They are different quantities: no two of them belong into one column.
+
+Written here, because ``skimage.metrics.structural_similarity`` has no mask and one kind of border: of the five it gives
+``map_mean`` alone (the maps differ by 6e-14 at most; 77 ms, 102 ms here, for 480 x 640 pixels). The tests compare the
+two.
 """
 
 from __future__ import annotations

@@ -12,6 +12,10 @@ network keeps slices on the batch axis:
 
 Pairs at 16^3 make every change of level between 32^3 and 8^3 a strided convolution or a ``DepthToSpace``
 without any transposition, and fill the 16-lane blocks in the head, which has eight outputs a slice.
+
+Written by hand, because ``torch.onnx.export`` (2.13, either exporter) keeps the 3D convolutions: the default network in
+fp32 denoises 449 cubes a second with this graph and 212 with the exported one (16 cubes a call, one thread, onnxruntime
+1.31; torch itself 332), and their outputs differ by 2.3e-6 at most.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
 """Two runs in one folder: one of them goes on, the other one is told."""
 
-import builtins
 import errno
 import os
 import signal
 import subprocess
 import sys
 import threading
+from pathlib import Path
 
 import pytest
 
@@ -17,6 +17,7 @@ from unghost.data_recipes.harvest.run import harvest
 from unghost.data_recipes.recipe import Recipe
 
 fcntl = pytest.importorskip("fcntl")
+filelock = pytest.importorskip("filelock")
 
 RECIPE = Recipe(parts=(1, 2))
 HOLDER = """
@@ -106,24 +107,42 @@ def test_where_there_are_no_locks_there_is_none(tmp_path, monkeypatch):
         patch.setattr(fcntl, "flock", unsupported)
         with locked(tmp_path, verb="curate"), locked(tmp_path, verb="curate"):
             pass
-    real = builtins.__import__
-
-    def without(name, *args, **kwargs):
-        if name == "fcntl":
-            raise ImportError(name)
-        return real(name, *args, **kwargs)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(builtins, "__import__", without)
+    assert not list(tmp_path.iterdir())
+    with monkeypatch.context() as patch:  # filelock's choice where there is no fcntl and no Windows
+        patch.setattr(filelock, "FileLock", filelock.SoftFileLock)
         with locked(tmp_path, verb="curate"), locked(tmp_path, verb="curate"):
             assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("code", [errno.EACCES, errno.EPERM, errno.EROFS])
+def test_in_a_folder_that_may_not_be_written_there_is_none(tmp_path, monkeypatch, code):
+    real = os.open
+
+    def refused(path, flags, *rest, **more):
+        if str(path).endswith(".lock"):
+            raise OSError(code, os.strerror(code), path)
+        return real(path, flags, *rest, **more)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "open", refused)
+        with locked(tmp_path, verb="curate"), locked(tmp_path, verb="curate"):
+            pass
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_missing_filelock_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "filelock", None)
+    rule = r"curate: filelock is not installed, .* would not be refused: pip install unghost\[recipes\]"
+    with pytest.warns(UserWarning, match=rule) as record, locked(tmp_path, verb="curate"):
+        assert not list(tmp_path.iterdir())
+    assert record[0].filename == __file__
+
+
 def test_a_full_disk_does_not_matter_to_the_lock(tmp_path, monkeypatch):
-    def full(handle, data):
+    def full(path, text, encoding):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(os, "write", full)
+    monkeypatch.setattr(Path, "write_text", full)
     with locked(tmp_path, verb="curate"):
         with pytest.raises(BlockingIOError, match=r"at work in .*: wait"), locked(tmp_path, verb="curate"):
             pass

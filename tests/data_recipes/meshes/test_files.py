@@ -2,6 +2,7 @@
 
 import csv
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from unghost.data_recipes.meshes.files import load_mesh, normalise, read_mesh_file
-from unghost.data_recipes.meshes.reading import MeshEmpty, triangulate
+from unghost.data_recipes.meshes.reading import MeshEmpty, MeshRejected, triangulate
 
 trimesh = pytest.importorskip("trimesh")
 
@@ -107,6 +108,113 @@ def test_star_shaped_polygons_keep_their_area(area, seed, n):
     if np.diff(np.append(angles, angles[0] + 2 * np.pi)).max() < np.pi:  # ... unless an edge passes behind it
         pieces = triangulate(np.stack([x, y, 0 * x], axis=1), np.array([n]), np.arange(n))
         assert area(pieces).sum() == pytest.approx(exact)
+
+
+def newell(ring):
+    """Vector area of a polygon ``(n, 3)``."""
+    return np.cross(ring, np.roll(ring, -1, axis=0)).sum(axis=0) / 2
+
+
+def assert_cut_inside(ring, area):
+    """Turned as the polygon and covering its area once: no overlap, nothing outside."""
+    pieces = triangulate(ring, np.array([len(ring)]), np.arange(len(ring)))
+    vectors = np.cross(pieces[:, 1] - pieces[:, 0], pieces[:, 2] - pieces[:, 0]) / 2
+    whole = newell(ring)
+    np.testing.assert_allclose(vectors.sum(axis=0), whole, rtol=1e-9, atol=1e-12)
+    assert area(pieces).sum() == pytest.approx(np.linalg.norm(whole), rel=1e-9)
+    return pieces
+
+
+def spiral(n, *, pitch, turns):
+    """A ribbon of ``n`` corners wound about the origin."""
+    angles = np.linspace(0, 2 * np.pi * turns, n // 2)
+    radii = 1 + pitch * angles / (2 * np.pi)
+    circle = np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
+    return np.concatenate([radii[:, None] * circle, ((radii + pitch / 2)[:, None] * circle)[::-1]])
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 40), st.booleans(), st.floats(-6, 6))
+@settings(max_examples=40, deadline=None)
+def test_spirals_in_any_plane_keep_their_area(area, seed, half, turned, exponent):
+    rng = np.random.default_rng(seed)
+    ring = spiral(2 * half + 20, pitch=rng.uniform(0.2, 2), turns=(2 * half + 20) / 40)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    ring = np.roll(ring, rng.integers(len(ring)), axis=0)[:: -1 if turned else 1] @ turn.T * 10**exponent
+    pieces = assert_cut_inside(ring, area)
+    assert len(pieces) == len(ring) - 2
+
+
+def test_a_spiral_of_many_corners_and_one_of_too_many(area):
+    assert_cut_inside(spiral(5000, pitch=1.0, turns=50), area)
+    ring = spiral(20_002, pitch=1.0, turns=50)
+    with pytest.raises(MeshRejected, match="a concave polygon of 20002 corners, more than 20000"):
+        triangulate(ring, np.array([len(ring)]), np.arange(len(ring)))
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=40, deadline=None)
+def test_quads_with_any_reflex_corner_are_cut_inside(area, seed):
+    """A triangle with a fourth corner inside it, put between any two of its corners, is a concave quad."""
+    rng = np.random.default_rng(seed)
+    weights = rng.dirichlet(np.ones(3)) * 0.97 + 0.01
+    corners = rng.normal(size=(3, 3))
+    ring = np.insert(corners, rng.integers(1, 4), weights @ corners, axis=0)[:: rng.choice([-1, 1])]
+    pieces = assert_cut_inside(np.roll(ring, rng.integers(4), axis=0), area)
+    assert len(pieces) == 2
+
+
+def test_a_hole_reached_by_a_slit_stays_open(area):
+    """A square of side 4 with a square hole of side 2: the polygon touches itself along the slit."""
+    outer = [[0, 0, 0], [4, 0, 0], [4, 4, 0], [0, 4, 0], [0, 0, 0]]
+    hole = [[1, 1, 0], [1, 3, 0], [3, 3, 0], [3, 1, 0], [1, 1, 0]]
+    ring = np.array([*outer, *hole], dtype=float)
+    for first in range(10):
+        assert area(assert_cut_inside(np.roll(ring, first, axis=0), area)).sum() == pytest.approx(12)
+
+
+def test_straight_corners_and_spikes_add_no_area(area):
+    """An L with a corner amid every edge, and one with a hair that goes out and back."""
+    ell = np.array([[0, 0, 0], [2, 0, 0], [2, 1, 0], [1, 1, 0], [1, 2, 0], [0, 2, 0]], dtype=float)
+    amid = (ell + np.roll(ell, -1, axis=0)) / 2
+    straight = np.stack([ell, amid], axis=1).reshape(-1, 3)
+    hair = np.insert(ell, 1, [[1, 0, 0], [1, -1, 0], [1, 0, 0]], axis=0)
+    for ring in (straight, hair):
+        assert area(assert_cut_inside(ring, area)).sum() == pytest.approx(3)
+
+
+def test_polygons_that_cross_themselves_stay_fans():
+    """No cut covers them once, so that none is better: a pentagram and a bow tie, beside a sound triangle."""
+    angles = np.arange(5) * 4 * np.pi / 5
+    star = np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
+    bow = np.array([[0, 0, 0], [3, 2, 0], [3, 0, 0], [0, 1, 0]], dtype=float)
+    vertices = np.concatenate([star, bow, [[0, 0, 1], [1, 0, 1], [0, 1, 1]]])
+    pieces = triangulate(vertices, np.array([5, 4, 3]), np.arange(12))
+    fan = [[0, 1, 2], [0, 2, 3], [0, 3, 4], [5, 6, 7], [5, 7, 8], [9, 10, 11]]
+    np.testing.assert_array_equal(pieces, vertices[fan])
+
+
+def test_polygons_keep_their_order(area):
+    """Concave and convex ones of 3 to 6 corners, mixed: each one's triangles stand where it stood."""
+    ell = np.array([[0, 0, 0], [2, 0, 0], [2, 1, 0], [1, 1, 0], [1, 2, 0], [0, 2, 0]], dtype=float)
+    dart = np.array([[0, 0, 0], [1, 1, 0], [0, 3, 0], [-1, 1, 0]]) * np.array([1, -1, 1]) + [0, 3, 0]
+    notch = np.array([[0, 0, 0], [2, 0, 0], [2, 2, 0], [1, 0.5, 0], [0, 2, 0]])
+    square, corner = ell[[0, 1, 1, 5]] + [[0, 0, 0], [0, 0, 0], [0, 2, 0], [0, 0, 0]], ell[[0, 1, 5]]
+    rings = [ell, square, dart, corner, notch, square, ell, notch]
+    rings = [ring + np.array([0, 0, 10 * i]) for i, ring in enumerate(rings)]
+    counts = np.array([len(ring) for ring in rings])
+    pieces = triangulate(np.concatenate(rings), counts, np.arange(counts.sum()))
+    heights = np.repeat(10.0 * np.arange(len(rings)), counts - 2)
+    np.testing.assert_array_equal(pieces[:, :, 2], heights[:, None].repeat(3, axis=1))
+    for i, ring in enumerate(rings):
+        assert area(pieces[heights == 10 * i]).sum() == pytest.approx(np.linalg.norm(newell(ring)))
+
+
+def test_only_concave_polygons_need_earcut(monkeypatch):
+    monkeypatch.setitem(sys.modules, "mapbox_earcut", None)
+    ell = np.array([[0, 0, 0], [2, 0, 0], [2, 1, 0], [1, 1, 0], [1, 2, 0], [0, 2, 0]], dtype=float)
+    assert len(triangulate(ell, np.array([4]), np.array([0, 1, 4, 5]))) == 2
+    with pytest.raises(ImportError, match=r"mapbox_earcut: pip install unghost\[recipes\]"):
+        triangulate(np.roll(ell, 1, axis=0), np.array([6]), np.arange(6))
 
 
 def test_far_from_the_origin_in_double_precision(written, samples):

@@ -26,12 +26,10 @@ CUBE = "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 1) for z in (0, 1
 FACES = "f 1 2 4 3\nf 5 7 8 6\nf 1 5 6 2\nf 3 4 8 7\nf 1 3 7 5\nf 2 6 8 4\n"
 
 
-def spiral(corners):
-    """A face that winds 12 times: cutting it into triangles takes quadratic time."""
-    turn = np.linspace(0, 24 * np.pi, corners // 2)
-    outer, inner = ((turn + width) * np.array([np.cos(turn), np.sin(turn)]) for width in (3, 1))
-    ring = np.concatenate([outer.T, inner.T[::-1]])
-    return "".join(f"v {x} {y} 0\n" for x, y in ring), "f " + " ".join(map(str, range(1, len(ring) + 1))) + "\n"
+def tangle(corners):
+    """A face of random corners, which crosses itself: cutting it into triangles takes quadratic time."""
+    ring = np.random.default_rng(0).random((corners, 2))
+    return "".join(f"v {x} {y} 0\n" for x, y in ring), "f " + " ".join(map(str, range(1, corners + 1))) + "\n"
 
 
 @pytest.fixture
@@ -43,8 +41,8 @@ def folder(tmp_path):
     (tmp_path / "deep" / "d.ply").write_bytes(b"ply\n")
     (tmp_path / "deep" / "e.OBJ").write_text(CUBE + FACES)
     (tmp_path / "notes.txt").write_text("no mesh")
-    vertices, face = spiral(1900)
-    (tmp_path / "slow.obj.kept").write_text(vertices + face * 50)
+    vertices, face = tangle(20_000)
+    (tmp_path / "slow.obj.kept").write_text(vertices + face * 40)
     return tmp_path
 
 

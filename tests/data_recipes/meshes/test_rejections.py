@@ -48,6 +48,7 @@ REJECTED = [
     ("ply", lambda s: s.triangle_ply.replace("vertex_indices", "others"), "without a list of vertex indices"),
     ("ply", lambda s: s.triangle_ply.replace("float y", "float128 y"), "PLY header line 'property float128 y'"),
     ("ply", lambda s: s.triangle_ply.replace("element", "elemental"), "PLY header line"),
+    ("ply", lambda s: s.triangle_ply.replace("property float y", "property"), "PLY header line 'property'"),
     ("stl", b"\0" * 80 + (2).to_bytes(4, "little") + b"\0" * 50, "184 bytes of binary STL, got 134"),
     ("stl", lambda s: "solid a\n" + s.facet, "1 whole facets that is cut short"),
     ("stl", lambda s: "solid a\n" + s.facet + s.facet[:60] + "endsolid a\n", "cut short"),
