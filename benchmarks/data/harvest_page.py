@@ -21,11 +21,12 @@ import tyro
 from numpy.typing import NDArray
 
 from unghost.core.occupancy import FREE_LABEL, SURFACE_LABEL, opacity_from_signed
+from unghost.core.shards.finding import find_shards
 from unghost.core.shards.packing import dequantize_signed, unpack_labels
 from unghost.core.shards.storage import ARRAYS, Shard, read_shard, write_shard
 from unghost.data_recipes.harvest.config import HarvestConfig
 from unghost.data_recipes.inspection.drawing import GHOST, SURFACE, UNJUDGED
-from unghost.data_recipes.inspection.preview import draw_pair, find_shards
+from unghost.data_recipes.inspection.preview import draw_pair
 
 ROOT = Path(__file__).resolve().parents[2]
 SAMPLE_CUBES = 60  # 82 kB each

@@ -20,10 +20,10 @@ import numpy as np
 import tyro
 
 from unghost import load_denoiser
-from unghost.cli.training import expand_shards
 from unghost.core.channels import CHANNEL_NAMES, SIGNED_OPACITY, SURROUNDINGS, TRANSMITTANCE, VIEW_COUNT
 from unghost.core.occupancy import DEFAULT_OPACITY_THRESHOLD, opacity_from_signed, signed_from_occupancy
 from unghost.core.results import build_results, write_results
+from unghost.core.shards.finding import expand_shards
 from unghost.core.shards.packing import dequantize_signed, quantize_signed
 from unghost.core.shards.storage import Shard, read_shard, write_shard
 from unghost.prior.networks.restoration import SIZES

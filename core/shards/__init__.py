@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 from ..lazy import attach
 
 if TYPE_CHECKING:
+    from .finding import expand_shards as expand_shards
+    from .finding import find_shards as find_shards
     from .packing import dequantize_share as dequantize_share
     from .packing import dequantize_signed as dequantize_signed
     from .packing import pack_frame as pack_frame
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
+        ".finding": ["expand_shards", "find_shards"],
         ".packing": [
             "dequantize_share",
             "dequantize_signed",
