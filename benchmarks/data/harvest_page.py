@@ -95,7 +95,7 @@ def write_sample(shards: list[Shard], target: Path) -> int:
         "sample_of": f"{len(shards)} scenes",
         "scenes": [{k: s.provenance[k] for k in ("seed", "scene", "field", "resolution", "steps")} for s in chosen],
     }
-    write_shard(target, arrays, provenance)
+    write_shard(target, arrays, provenance, kind="harvest")
     return sum(path.stat().st_size for path in target.iterdir())
 
 

@@ -142,5 +142,5 @@ def capture_shards(
             "sha256": record["sha256"],
             "licence": "see the capture",
         }
-        write_shard(target, arrays, provenance)
+        write_shard(target, arrays, provenance, kind="harvest")
     return shards

@@ -113,7 +113,7 @@ def bit_shards(shards: Iterable[tuple[str, float]], folder: Path) -> list[tuple[
         if not (target / "manifest.json").exists():
             shard = read_shard(source)
             inputs = quantize_signed(as_bits(dequantize_signed(np.array(shard.inputs))))
-            write_shard(target, {"inputs": inputs, **_untouched(shard)}, shard.provenance)
+            write_shard(target, {"inputs": inputs, **_untouched(shard)}, shard.provenance, kind=shard.kind)
         made.append((str(target), weight))
     return made
 
