@@ -104,7 +104,8 @@ def _grown(slab: NDArray[Any]) -> NDArray[np.uint8]:
     factor = WIDTH // len(slab)
     picture = np.repeat(np.repeat(np.swapaxes(slab, 0, 1)[::-1], factor, axis=0), factor, axis=1)
     picture = np.repeat(picture[..., None], 3, axis=2) if picture.ndim == 2 else picture
-    return (255 * np.clip(picture, 0, 1)).round().astype(np.uint8)
+    levels: NDArray[np.uint8] = (255 * np.clip(picture, 0, 1)).round().astype(np.uint8)
+    return levels
 
 
 def draw_row(shard: Shard, row: int) -> list[NDArray[np.uint8]]:

@@ -35,7 +35,8 @@ from unghost.evaluation.scoring.protocol import optical_depth
 
 from ..fit_cache import FitCache, code_hash, file_hash, say
 from ..two_trajectory.real_capture import Options as CaptureOptions
-from ..two_trajectory.real_capture import Sweep, fit_field, render
+from ..two_trajectory.real_capture import fit_field, render
+from ..two_trajectory.scenes import Sweep
 
 STEPS = 360  # of fitting a field, as in docs/results/capture.json
 VOTES = 2

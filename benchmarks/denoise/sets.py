@@ -71,7 +71,7 @@ class CubeSet:
 
     def first(self, count: int) -> CubeSet:
         """The first ``count`` cubes of it."""
-        arrays = {
+        arrays: dict[str, Any] = {
             item.name: value[:count]
             for item in dataclasses.fields(self)
             if isinstance(value := getattr(self, item.name), np.ndarray)

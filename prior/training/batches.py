@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections import deque
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -207,7 +207,7 @@ class Mixture:
             np.array([_harvested(d.shard) for d in draws]),
         )
 
-    def stream(self, first_step: int, batch_size: int, *, ahead: int = 2) -> Iterator[Batch]:
+    def stream(self, first_step: int, batch_size: int, *, ahead: int = 2) -> Generator[Batch, None, None]:
         """Batches ``first_step``, ``first_step + 1``, … for ever, ``ahead`` of them prepared in threads."""
         with ThreadPoolExecutor(max_workers=max(1, ahead)) as pool:
             pending: deque[Future[Batch]] = deque()
