@@ -10,7 +10,6 @@ positions.
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass
 
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..core.cameras import Cameras
+from ..core.interpolate import trilinear_corners
 from ..fields.kinds import TrainableField
 from ..fields.radiance import CONTRACTED, contract
 from ..fields.rendering import Rendering, Sampling, render_rays
@@ -188,13 +188,4 @@ def _add(hessian: Tensor, ray: Tensor, positions: Tensor, moved: Tensor, level: 
 def _corners(positions: Tensor, level: int) -> tuple[Tensor, Tensor]:
     """Flat indices ``(N, 8)`` and trilinear weights of the nodes around positions, in the contracted cube."""
     cells = 2**level
-    place = (contract(positions) + CONTRACTED) / (2 * CONTRACTED) * cells
-    low = place.floor().clamp(0, cells - 1)
-    up = place - low
-    base = low.to(torch.int64)
-    indices, weights = [], []
-    for corner in itertools.product((0, 1), repeat=3):
-        node = base + torch.tensor(corner)
-        indices.append((node[:, 0] * (cells + 1) + node[:, 1]) * (cells + 1) + node[:, 2])
-        weights.append(torch.where(torch.tensor(corner, dtype=torch.bool), up, 1.0 - up).prod(1))
-    return torch.stack(indices, 1), torch.stack(weights, 1)
+    return trilinear_corners((contract(positions) + CONTRACTED) / (2 * CONTRACTED) * cells, (cells + 1,) * 3)

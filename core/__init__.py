@@ -45,6 +45,10 @@ if TYPE_CHECKING:
     from .frames import cube_lattices as cube_lattices
     from .frames import random_rotations as random_rotations
     from .frames import unit_lattice as unit_lattice
+    from .interpolate import corner_weights as corner_weights
+    from .interpolate import interpolate_grid as interpolate_grid
+    from .interpolate import lower_nodes as lower_nodes
+    from .interpolate import trilinear_corners as trilinear_corners
     from .lattice import cell_centers as cell_centers
     from .lattice import cell_pitch as cell_pitch
     from .lattice import cells_within as cells_within
@@ -113,6 +117,7 @@ __getattr__, __dir__, __all__ = attach(
             "with_unknown",
         ],
         ".frames": ["CubeFrame", "RESOLUTION", "cube_lattices", "random_rotations", "unit_lattice"],
+        ".interpolate": ["corner_weights", "interpolate_grid", "lower_nodes", "trilinear_corners"],
         ".lattice": ["cell_centers", "cell_pitch", "cells_within", "lattice_axes", "lattice_origin", "look_up_cells"],
         ".lazy": ["attach"],
         ".manifest": ["Denoiser", "METADATA_KEY", "Manifest"],

@@ -75,7 +75,7 @@ class _Plan:
             arrays["source"] = np.searchsorted(rows, arrays["group"]).astype(np.int32)
             provenance["sources"] = [sources[row] for row in rows.tolist()]
             provenance["rejected"] = [rejected[row] for row in sorted(rejected)]
-        write_shard(self.folder, arrays, provenance)
+        write_shard(self.folder, arrays, provenance, kind="pairs")
         return provenance
 
 

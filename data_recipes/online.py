@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -91,7 +91,7 @@ class OnlinePairs:
         first = step * batch_size
         return _batch(make_chunk(self.recipe, self.seed, self._root, first, first + batch_size), first)
 
-    def stream(self, first_step: int, batch_size: int, *, ahead: int = 2) -> Iterator[PairBatch]:
+    def stream(self, first_step: int, batch_size: int, *, ahead: int = 2) -> Generator[PairBatch, None, None]:
         """Batches ``first_step``, ``first_step + 1``, ... for ever, the same for any number of workers.
 
         Closing the iterator (or dropping it) ends the workers; so does an interrupt, and the death of this
@@ -111,7 +111,7 @@ class OnlinePairs:
             raise ValueError(f"OnlinePairs.stream: ahead must be >= 1, got {ahead}")
         return self._stream(first_step * batch_size, batch_size, ahead)
 
-    def _stream(self, first: int, batch_size: int, ahead: int) -> Iterator[PairBatch]:
+    def _stream(self, first: int, batch_size: int, ahead: int) -> Generator[PairBatch, None, None]:
         tasks = ((self.recipe, self.seed, self._root, *span) for span in spans(first, None, batch_size))
         with (
             LocalEngine(self.workers, ahead=self.workers + ahead) as engine,

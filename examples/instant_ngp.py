@@ -11,6 +11,7 @@ from __future__ import annotations
 import struct
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from unghost.fields.adapters.grids import cell_centers, save_grid
 from unghost.fields.adapters.instant_ngp import CELLS, SHORTEST_STEP, load_instant_ngp, morton_index
 
 
-def msgpack(value: object) -> bytes:
+def msgpack(value: dict[str, Any] | list[Any] | bytes | str | float) -> bytes:
     """Just enough of MessagePack to make a snapshot of."""
     if isinstance(value, dict):
         return b"\xdf" + struct.pack(">I", len(value)) + b"".join(msgpack(k) + msgpack(v) for k, v in value.items())

@@ -69,7 +69,7 @@ def main() -> None:
     keep = cleaned.keep
     print(f"{target}: {keep.sum():,} of {len(keep):,} Gaussians kept")
     splats = read_splat_ply(path)
-    if "made_as" in splats.rows.dtype.names:
+    if "made_as" in (splats.rows.dtype.names or ()):
         ghost = np.asarray(splats.rows["made_as"]) == 1
         print(f"{(~keep)[ghost].mean():.1%} of the floaters removed, {keep[~ghost].mean():.1%} of the rest kept")
 

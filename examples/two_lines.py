@@ -53,7 +53,7 @@ def main() -> None:
 
     regularizer = DensityRegularizer(load_denoiser(), aabb=AABB, field_pitch=PITCH, cubes=8)
     for step in range(180):
-        loss = sum(regularizer(field.density_fn).values())  # add it to your photometric loss
+        loss = sum(regularizer(field.density_fn).values(), torch.zeros(()))  # add it to your photometric loss
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

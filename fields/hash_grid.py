@@ -14,8 +14,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ..core.interpolate import corner_weights, lower_nodes
 from .implicit import EncodedField, check_encoded
-from .trilinear import corner_weights, weighted_rows
+from .trilinear import weighted_rows
 
 PRIMES = (1, 2654435761, 805459861)
 
@@ -78,18 +79,17 @@ def level_corners(unit: Tensor, resolution: int, rows: int) -> tuple[Tensor, Ten
 
     The eight stand in the order 000, 001, .., 111 of ``xyz``. A NaN gives NaN weights and some valid row.
     """
-    coordinates = unit * resolution
-    low = coordinates.floor().nan_to_num_(0.0).clamp_(0, resolution - 1)
+    lower, shares = lower_nodes((unit * resolution).unbind(-1), (resolution + 1,) * 3)
     side = resolution + 1
     dense = side**3 <= rows
     # Only the low bits of a product count, and they come from the low bits of its factors: no overflow in int32.
     factors = (side * side, side, 1) if dense else tuple(prime % rows for prime in PRIMES)
     join = torch.add if dense else torch.bitwise_xor
-    nearer = [column * factor for column, factor in zip(low.to(torch.int32).T, factors)]
+    nearer = [node.to(torch.int32) * factor for node, factor in zip(lower, factors)]
     x, y, z = ((near, near + factor) for near, factor in zip(nearer, factors))
     corners = [join(first, last) for one in x for two in y for first in (join(one, two),) for last in z]
     index = torch.stack(corners, dim=1)
-    return index if dense else index.bitwise_and_(rows - 1), corner_weights(coordinates - low)
+    return index if dense else index.bitwise_and_(rows - 1), torch.stack(corner_weights(shares), dim=1)
 
 
 def hash_encode(table: Tensor, unit: Tensor, resolutions: tuple[int, ...], rows: int) -> Tensor:

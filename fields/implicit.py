@@ -68,7 +68,7 @@ def network(sizes: list[int], generator: torch.Generator) -> nn.Sequential:
     """
     layers: list[nn.Module] = []
     for number, (inputs, outputs) in enumerate(pairwise(sizes), start=2):
-        layer = nn.utils.skip_init(nn.Linear, inputs, outputs)  # type: ignore[no-untyped-call]
+        layer = nn.utils.skip_init(nn.Linear, inputs, outputs)
         bound = math.sqrt(6.0 / inputs) * (0.1 if number == len(sizes) else 1.0)
         with torch.no_grad():
             layer.weight.uniform_(-bound, bound, generator=generator)

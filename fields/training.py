@@ -186,7 +186,7 @@ def train_field(
         if not np.isfinite(errors[-1]):
             raise FloatingPointError(f"train_field: the loss is not finite at step {step}")
         optimizer.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()
         optimizer.step()
         step += 1
         bar.update(1)

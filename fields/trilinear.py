@@ -1,8 +1,9 @@
-"""Trilinear lookup in a dense grid, fast on a CPU.
+"""Trilinear interpolation of a dense grid that is trained: a fast backward pass on a CPU.
 
-A lookup is a sparse matrix (8 weights a row) times the table. On a CPU the product runs as a
-compressed-row product in torch and its transpose in scipy: measured 5-8 times faster than
-``grid_sample`` or ``embedding_bag`` with their backward passes.
+Nodes and weights come from :mod:`unghost.core.interpolate`. A lookup is a sparse matrix (8 weights a row) times the
+table. On a CPU the product runs as a compressed-row product in torch and its transpose in scipy: measured 5-8 times
+faster than ``grid_sample`` or ``embedding_bag`` with their backward passes, and on one thread 2.1-3.7 times faster
+than ``interpolate_grid`` with its own (20,000 to 200,000 positions, 1 and 12 channels; on two threads 8-136 times).
 """
 
 from __future__ import annotations
@@ -13,26 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-
-def corner_weights(high: Tensor) -> Tensor:
-    """Trilinear weights ``(N, 8)`` of a cell's corners 000, 001, .., 111 from the place ``high (N, 3)`` in it.
-
-    One long product for each corner: five times as fast on a CPU as broadcasting over (N, 2, 2, 2).
-    """
-    upper = high.T.contiguous()
-    x, y, z = ((low, up) for low, up in zip(1.0 - upper, upper))
-    return torch.stack([first * last for one in x for two in y for first in (one * two,) for last in z], dim=1)
-
-
-def _corners(coordinates: Tensor, resolution: int) -> tuple[Tensor, Tensor]:
-    """Flat indices ``(N, 8)`` int32 and weights ``(N, 8)`` of the nodes around ``coordinates (N, 3)``."""
-    low = coordinates.floor().nan_to_num_(0.0).clamp_(0, resolution - 2)  # NaN must not become an index
-    cell = low.to(torch.int32)
-    base = (cell[:, 0] * resolution + cell[:, 1]) * resolution + cell[:, 2]
-    plane = resolution * resolution
-    offsets = [x * plane + y * resolution + z for x in (0, 1) for y in (0, 1) for z in (0, 1)]
-    index = base[:, None] + torch.tensor(offsets, dtype=torch.int32, device=base.device)
-    return index, corner_weights(coordinates - low)
+from ..core.interpolate import trilinear_corners
 
 
 def _scatter(index: Tensor, weights: Tensor, grad: Tensor, nodes: int) -> Tensor:
@@ -105,4 +87,4 @@ def trilinear(table: Tensor, coordinates: Tensor, resolution: int) -> Tensor:
         raise ValueError(
             f"trilinear: table must have {resolution**3} rows for resolution {resolution}, got {len(table)}"
         )
-    return weighted_rows(table, *_corners(coordinates.detach(), resolution))
+    return weighted_rows(table, *trilinear_corners(coordinates.detach(), (resolution,) * 3))

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.cameras import Cameras
+from ..core.interpolate import interpolate_grid
 
 Floats = NDArray[np.float32]
 SUN = np.array([0.42, -0.50, 0.76]) / np.linalg.norm([0.42, -0.50, 0.76])
@@ -83,21 +84,6 @@ def _interval(aabb: NDArray[np.float64], origins: Any, directions: Any) -> tuple
     return np.maximum(near, 0.0), np.nanmin(crossings.max(axis=0), axis=-1)
 
 
-def _trilinear(samples: Floats, where: Floats) -> Floats:
-    """``samples (X, Y, Z, C)`` at fractional indices ``where (n, 3)``, ``(n, C)``."""
-    shape = np.array(samples.shape[:3])
-    where = np.clip(where, 0.0, shape - 1.001)
-    low = where.astype(np.int32)
-    share = (where - low).astype(np.float32)
-    strides = np.array([shape[1] * shape[2], shape[2], 1])
-    base, flat = low @ strides, samples.reshape(-1, samples.shape[-1])
-    total = np.zeros((len(where), samples.shape[-1]), dtype=np.float32)
-    for corner in np.ndindex(2, 2, 2):
-        weight = np.where(corner, share, 1.0 - share).prod(axis=-1)
-        total += weight[:, None] * flat[base + int(np.dot(corner, strides))]
-    return total
-
-
 def render(volume: Volume, camera: Cameras, *, steps_per_cell: float = 1.6) -> Floats:
     """March every pixel's ray through the volume; ``(height, width, 3)`` in [0, 1] on a paper background."""
     from scipy.ndimage import distance_transform_cdt, maximum_filter
@@ -121,7 +107,7 @@ def render(volume: Volume, camera: Cameras, *, steps_per_cell: float = 1.6) -> F
         hit = room < 0
         rays = alive[hit]
         if len(rays):
-            sample = _trilinear(volume.samples, where[hit])
+            sample = interpolate_grid(volume.samples, where[hit])
             opacity = 1.0 - np.exp(-sample[:, 3] / np.float32(steps_per_cell))
             color[rays] += (clear[rays] * opacity)[:, None] * sample[:, :3]
             clear[rays] *= 1.0 - opacity

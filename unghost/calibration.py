@@ -47,11 +47,11 @@ def _manifest(path: Path) -> Manifest:
 
 def _stored(folder: Path, cubes: int, names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Channels and edge fractions of cubes evenly spread over the shards of a folder."""
-    from .cli.training import expand_shards
+    from .core.shards.finding import find_shards
     from .core.shards.storage import read_shard
     from .prior.training.batches import stored_channels
 
-    shards = [read_shard(path) for path, _ in expand_shards(str(folder))]
+    shards = [read_shard(path) for path in find_shards(folder)]
     shares = [len(share) for share in np.array_split(np.arange(cubes), len(shards))]
     rows = [np.linspace(0, len(shard) - 1, share).astype(np.int64) for shard, share in zip(shards, shares)]
     channels = np.concatenate([stored_channels(shard, row, names) for shard, row in zip(shards, rows)])

@@ -185,7 +185,7 @@ def component(gaussians: Gaussians) -> Mask:
     grid[tuple(cells[solid].T)] = True
     labels, _ = ndimage.label(grid, np.ones((3, 3, 3)))
     largest = np.bincount(labels.ravel())[1:].argmax() + 1
-    mask = ~inside
+    mask: NDArray[np.bool_] = ~inside
     mask[inside] = labels[tuple(cells[inside].T)] == largest
     return mask
 

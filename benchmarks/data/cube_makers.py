@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from functools import lru_cache
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,11 +85,8 @@ def every_voxel(start: int, stop: int) -> Packed:
         shell = compose.shell_from_distance(values.astype(np.float32), thickness=thickness)
         return shell | (values < 0) if solid else shell
 
-    kept, compose.shell_in_cube = compose.shell_in_cube, plainly
-    try:
+    with patch.object(compose, "shell_in_cube", plainly):
         return our_procedural(start, stop)
-    finally:
-        compose.shell_in_cube = kept
 
 
 def frames(start: int, stop: int) -> list[CubeFrame]:

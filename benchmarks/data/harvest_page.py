@@ -22,11 +22,12 @@ import tyro
 from numpy.typing import NDArray
 
 from unghost.core.occupancy import FREE_LABEL, SURFACE_LABEL, opacity_from_signed
+from unghost.core.shards.finding import find_shards
 from unghost.core.shards.packing import dequantize_signed, unpack_labels
 from unghost.core.shards.storage import ARRAYS, Shard, read_shard, write_shard
 from unghost.data_recipes.harvest.config import HarvestConfig
 from unghost.data_recipes.inspection.drawing import GHOST, SURFACE, UNJUDGED
-from unghost.data_recipes.inspection.preview import draw_pair, find_shards
+from unghost.data_recipes.inspection.preview import draw_pair
 
 ROOT = Path(__file__).resolve().parents[2]
 SAMPLE_CUBES = 8  # 82 kB each
@@ -102,7 +103,7 @@ def write_sample(shards: list[Shard], target: Path) -> int:
         "sample_of": f"{len(shards)} scenes",
         "scenes": [{k: s.provenance[k] for k in ("seed", "scene", "field", "resolution", "steps")} for s in chosen],
     }
-    write_shard(target, arrays, provenance)
+    write_shard(target, arrays, provenance, kind="harvest")
     return sum(path.stat().st_size for path in target.iterdir())
 
 
@@ -111,7 +112,8 @@ def _grown(slab: NDArray[Any]) -> NDArray[np.uint8]:
     factor = WIDTH // len(slab)
     picture = np.repeat(np.repeat(np.swapaxes(slab, 0, 1)[::-1], factor, axis=0), factor, axis=1)
     picture = np.repeat(picture[..., None], 3, axis=2) if picture.ndim == 2 else picture
-    return (255 * np.clip(picture, 0, 1)).round().astype(np.uint8)
+    levels: NDArray[np.uint8] = (255 * np.clip(picture, 0, 1)).round().astype(np.uint8)
+    return levels
 
 
 def draw_row(shard: Shard, row: int) -> list[NDArray[np.uint8]]:

@@ -25,13 +25,13 @@ import tyro
 
 from unghost.core.occupancy import signed_from_occupancy
 from unghost.core.results import build_results, write_results
+from unghost.core.shards.finding import find_shards
 from unghost.core.shards.packing import quantize_signed
 from unghost.core.shards.storage import read_shard
 from unghost.data_recipes.corruptions.structured import CORRUPTIONS
 from unghost.data_recipes.curation import curate
 from unghost.data_recipes.harvest.config import HarvestConfig
 from unghost.data_recipes.harvest.run import harvest
-from unghost.data_recipes.inspection.preview import find_shards
 from unghost.data_recipes.inspection.statistics import (
     FEATURES,
     CubeStatistics,

@@ -35,7 +35,8 @@ from unghost.evaluation.scoring.depths import optical_depth
 
 from ..fit_cache import FitCache, code_hash, file_hash, say
 from ..two_trajectory.real_capture import Options as CaptureOptions
-from ..two_trajectory.real_capture import Sweep, fit_field, render
+from ..two_trajectory.real_capture import fit_field, render
+from ..two_trajectory.scenes import Sweep
 
 STEPS = 360  # of fitting a field, as in docs/results/capture.json
 VOTES = 2
@@ -142,5 +143,5 @@ def capture_shards(
             "sha256": record["sha256"],
             "licence": "see the capture",
         }
-        write_shard(target, arrays, provenance)
+        write_shard(target, arrays, provenance, kind="harvest")
     return shards

@@ -11,7 +11,7 @@ unknown (``blind``). Training resumes where it was killed. Writes docs/results/c
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,10 +20,10 @@ import numpy as np
 import tyro
 
 from unghost import load_denoiser
-from unghost.cli.training import expand_shards
 from unghost.core.channels import CHANNEL_NAMES, SIGNED_OPACITY, SURROUNDINGS, TRANSMITTANCE, VIEW_COUNT
 from unghost.core.occupancy import DEFAULT_OPACITY_THRESHOLD, opacity_from_signed, signed_from_occupancy
 from unghost.core.results import build_results
+from unghost.core.shards.finding import expand_shards
 from unghost.core.shards.packing import dequantize_signed, quantize_signed
 from unghost.core.shards.storage import Shard, read_shard, write_shard
 from unghost.prior.networks.restoration import SIZES
@@ -103,18 +103,19 @@ class Options:
 
 def as_bits(signed: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
     """Signed opacity to -1 or +1 by the opacity threshold."""
-    return signed_from_occupancy(opacity_from_signed(signed) > DEFAULT_OPACITY_THRESHOLD)
+    bits: np.ndarray[Any, Any] = signed_from_occupancy(opacity_from_signed(signed) > DEFAULT_OPACITY_THRESHOLD)
+    return bits
 
 
-def bit_shards(shards: Iterable[tuple[str, float]], folder: Path) -> list[tuple[str, float]]:
+def bit_shards(shards: Iterable[tuple[str | Path, float]], folder: Path) -> list[tuple[str | Path, float]]:
     """The same shards with inputs made bits, and with nothing about the cubes."""
-    made = []
+    made: list[tuple[str | Path, float]] = []
     for number, (source, weight) in enumerate(shards):
         target = folder / f"{number:05d}"
         if not (target / "manifest.json").exists():
             shard = read_shard(source)
             inputs = quantize_signed(as_bits(dequantize_signed(np.array(shard.inputs))))
-            write_shard(target, {"inputs": inputs, **_untouched(shard)}, shard.provenance)
+            write_shard(target, {"inputs": inputs, **_untouched(shard)}, shard.provenance, kind=shard.kind)
         made.append((str(target), weight))
     return made
 
@@ -128,7 +129,7 @@ def seen(cubes: CubeSet, variant: str) -> CubeSet:
     return dataclasses.replace(cubes, signed=as_bits(cubes.signed)) if variant == BIT else cubes
 
 
-def trained(variant: str, options: Options, shards: Sequence[tuple[str, float]]) -> Path:
+def trained(variant: str, options: Options, shards: Sequence[tuple[str | Path, float]]) -> Path:
     """The model of a variant, trained unless it is there."""
     folder = options.runs / variant.replace(" ", "-").replace(",", "")
     model = folder / "model.safetensors"
@@ -152,7 +153,7 @@ def rows_of(variant: str, model: Path, sets: Sequence[CubeSet]) -> list[dict[str
     """Scores of a variant, and of the same one blind."""
     denoiser = load_denoiser(model)
     about = {"channels": list(VARIANTS[variant]), "parameters": denoiser.manifest.parameters}
-    ways = [(variant, lambda cubes: cubes)]
+    ways: list[tuple[str, Callable[[CubeSet], CubeSet]]] = [(variant, lambda cubes: cubes)]
     if len(VARIANTS[variant]) > 1:
         ways.append((f"{variant}, blind", blind))
     rows: list[dict[str, Any]] = []

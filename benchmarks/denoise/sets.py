@@ -20,11 +20,11 @@ from unghost.core.occupancy import (
     signed_from_occupancy,
     signed_from_opacity,
 )
+from unghost.core.shards.finding import find_shards
 from unghost.core.shards.packing import dequantize_signed, unpack_labels
 from unghost.core.shards.storage import Shard, read_shard
 from unghost.data_recipes.corruptions.structured import CORRUPTIONS, corrupt
 from unghost.data_recipes.curation import curate
-from unghost.data_recipes.inspection.preview import find_shards
 from unghost.data_recipes.recipe import load_recipe
 from unghost.data_recipes.solids.compose import dilate
 from unghost.fields.adapters.sdf import laplace_density
@@ -71,7 +71,7 @@ class CubeSet:
 
     def first(self, count: int) -> CubeSet:
         """The first ``count`` cubes of it."""
-        arrays = {
+        arrays: dict[str, Any] = {
             item.name: value[:count]
             for item in dataclasses.fields(self)
             if isinstance(value := getattr(self, item.name), np.ndarray)

@@ -167,8 +167,11 @@ def main() -> None:
     import nerfbaselines
 
     registered = sorted(each for each in nerfbaselines.get_supported_evaluation_protocols() if "unghost" in each)
-    extra = {"nerfbaselines": importlib.metadata.version("nerfbaselines"), "registered": registered}
-    extra |= {"same_formula": whole_metrics(photos, colours, maps)}
+    extra = {
+        "nerfbaselines": importlib.metadata.version("nerfbaselines"),
+        "registered": registered,
+        "same_formula": whole_metrics(photos, colours, maps),
+    }
     results = build_results(rows, command="make nerfbaselines", seeds=[0], **extra)
     write_results(options.out / "nerfbaselines.json", results)
     print(options.out / "nerfbaselines.json")

@@ -99,12 +99,13 @@ def step_row(name: str, denoiser: Any, room: GridField, repeats: int, cameras: C
     def noted(positions: torch.Tensor) -> torch.Tensor:
         if torch.is_grad_enabled():  # what is asked for the channels' sake is not the field's share of the step
             asked.append(positions)
-        return room(positions)
+        density: torch.Tensor = room(positions)
+        return density
 
     def step() -> None:
         room.zero_grad()
         asked.clear()
-        regularizer(noted)["dsds"].backward()  # type: ignore[no-untyped-call]
+        regularizer(noted)["dsds"].backward()
 
     def queries() -> None:
         room.zero_grad()
@@ -162,7 +163,7 @@ def visibility_rows(options: Options) -> list[dict[str, Any]]:
         ways[f"cells of 1/{8 << (levels - 1)} alone"] = functools.partial(
             lambda grid: grid.look_up(points)[0] != 0, grid
         )
-    truth, rows = cameras.view_count(points) > 0, []
+    truth, rows = cameras.view_count(points) > 0, list[dict[str, Any]]()
     for name, way in ways.items():
         seconds, found = median_seconds(way, options.repeats)
         rows.append(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -117,6 +118,7 @@ def largest_float64(_: torch.dtype) -> None:
         )
         assert loss.isinf() if beyond else relative(loss.item(), 10.0 * value) < 1e-15
         loss.backward()
+        assert density.grad is not None
         assert (density.grad == 10.0 / 8).all()
     grid = torch.zeros((2, 2, 2), dtype=torch.float64)
     grid[1, 0, 0] = 1e308
@@ -152,7 +154,7 @@ def spread(dtype: torch.dtype) -> float:
 def no_edges(dtype: torch.dtype) -> None:
     for bad in (math.inf, math.nan):
         edges = torch.tensor([[0.0, 1.0, bad]], dtype=dtype)
-        refuses(lambda e=edges: distortion_loss(torch.ones(1, 2), e), ValueError, f"1 of 3 that are not; first {bad}")
+        refuses(partial(distortion_loss, torch.ones(1, 2), edges), ValueError, f"1 of 3 that are not; first {bad}")
 
 
 def scaled(dtype: torch.dtype) -> float:
@@ -169,15 +171,16 @@ def scaled(dtype: torch.dtype) -> float:
 def no_distances(dtype: torch.dtype) -> None:
     for bad in (-1.0, math.nan):
         distance = torch.tensor([0.0, bad], dtype=dtype)
-        refuses(lambda d=distance: scale_gradients(torch.ones(2), d), ValueError, f"1 of 2 that are not; first {bad:g}")
+        refuses(partial(scale_gradients, torch.ones(2), distance), ValueError, f"1 of 2 that are not; first {bad:g}")
 
 
 def half_gradient(dtype: torch.dtype) -> None:
     """The gradient of one voxel in a million lies below float16's smallest number."""
     level = torch.full((1 << 20,), 2.0, dtype=dtype, requires_grad=True)
     stable_mean(dsds_loss(level, -torch.ones(len(level)), target_density=1.0)).backward()
+    assert level.grad is not None
     assert (level.grad == torch.tensor(2.0**-20, dtype=dtype)).all()
-    level.grad = None
+    level.grad.zero_()
     (0.01 * stable_mean(dsds_loss(level, -torch.ones(len(level)), target_density=1.0))).backward()
     assert (level.grad == 0).all()
 

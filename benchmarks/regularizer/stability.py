@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -56,6 +57,11 @@ def build(value: float | None, *, unit: float = 1.0, **settings: Any) -> Density
     return DensityRegularizer(Fixed(value), aabb=BOX * unit, **options)
 
 
+def everywhere(positions: torch.Tensor, level: torch.Tensor) -> torch.Tensor:
+    """A field of one density."""
+    return level.expand(len(positions))
+
+
 def constant(value: float, dtype: torch.dtype) -> float:
     """Worst relative error of both losses and both halves on a field of one value."""
     errors = []
@@ -64,7 +70,7 @@ def constant(value: float, dtype: torch.dtype) -> float:
     for answer, expected in ((-1.0, depth), (1.0, max(TARGET - depth, 0.0))):
         level = torch.tensor(value, dtype=dtype, requires_grad=True)
         regularizer = build(answer, cameras=cameras())
-        losses = regularizer(lambda p, level=level: level.expand(len(p)))
+        losses = regularizer(partial(everywhere, level=level))
         share = regularizer.report["unseen"] / regularizer.report["points"]
         total = losses["dsds"] + losses["visibility"]
         total.backward()
@@ -88,16 +94,19 @@ def raises(value: float, dtype: torch.dtype) -> None:
     assert dropping.report["dropped"] > 0
 
 
+def filled(positions: Any, dtype: Any) -> Any:
+    """Ones of a numpy type."""
+    return np.ones(len(positions), dtype)
+
+
 def no_densities(dtype: torch.dtype) -> None:
     """Truth values, complex numbers, text: refused; ``clean`` alone, which needs no gradient, takes integers."""
     for kind in (torch.bool, torch.complex64, torch.int64):
-        refuses(lambda k=kind: build(None)(lambda p: torch.ones(len(p), dtype=k)), TypeError, f"got {kind}")
+        refuses(partial(build(None), partial(everywhere, level=torch.ones((), dtype=kind))), TypeError, f"got {kind}")
     for made in (np.bool_, np.complex64, np.str_):
-        refuses(
-            lambda m=made: clean(lambda p: np.ones(len(p), m), BOX, denoiser=Fixed(None), resolution=16),
-            TypeError,
-            "integers or floating-point",
-        )
+        field = partial(filled, dtype=made)
+        cleaning = partial(clean, field, BOX, denoiser=Fixed(None), resolution=16)
+        refuses(cleaning, TypeError, "integers or floating-point")
     clean(lambda p: np.full(len(p), 3), BOX, denoiser=Fixed(None), resolution=16)
 
 
@@ -108,7 +117,7 @@ def elsewhere(dtype: torch.dtype) -> None:
 def warns(level: torch.Tensor, text: str) -> None:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        build(0.0)(lambda positions: level.expand(len(positions)))
+        build(0.0)(partial(everywhere, level=level))
     assert sum(text in str(warning.message) for warning in caught) == 1
 
 
@@ -116,11 +125,16 @@ def smooth(p: Any) -> Any:
     return 40.0 * torch.sigmoid(12.0 * (0.6 - p.norm(dim=-1)))
 
 
+def rounded(p: Any, dtype: torch.dtype) -> Any:
+    """The smooth field, its densities rounded to a type."""
+    return smooth(p.double()).to(dtype)
+
+
 def precision(dtype: torch.dtype) -> float:
     """Both losses of a smooth field whose densities are rounded to ``dtype``, against float64."""
     totals = []
     for kind in (dtype, torch.float64):
-        losses = build(None, cameras=cameras())(lambda p, kind=kind: smooth(p.double()).to(kind))
+        losses = build(None, cameras=cameras())(partial(rounded, dtype=kind))
         totals.append(sum(loss.item() for loss in losses.values()))
     return relative(*totals)
 
@@ -146,8 +160,7 @@ def cleaned(dtype: torch.dtype) -> float:
     """Scores of a smooth field whose densities are rounded to ``dtype``, against float64; the masks agree."""
     kinds = (dtype, torch.float64)
     ours, exact = (
-        judge(lambda p, k=kind: smooth(p.double()).to(k), BOX, denoiser=Fixed(None), resolution=32, backend="torch")
-        for kind in kinds
+        judge(partial(rounded, dtype=kind), BOX, denoiser=Fixed(None), resolution=32, backend="torch") for kind in kinds
     )
     assert (ours.mask().cells == exact.mask().cells).mean() > 0.999
     return float(np.abs(ours.score.astype(float) - exact.score).max())

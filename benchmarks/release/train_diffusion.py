@@ -17,7 +17,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from unghost.cli.training import expand_shards
+from unghost.core.shards.finding import expand_shards
 from unghost.prior.networks.restoration import SIZES
 from unghost.prior.networks.unet import UNetConfig
 from unghost.prior.training.config import TrainConfig

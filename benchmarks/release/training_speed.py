@@ -23,9 +23,9 @@ from typing import Any
 import torch
 import tyro
 
-from unghost.cli.training import expand_shards
 from unghost.core.channels import CHANNEL_NAMES
 from unghost.core.results import build_results, write_results
+from unghost.core.shards.finding import expand_shards
 from unghost.prior.networks.restoration import SIZES
 from unghost.prior.training.allocator import keep_freed_memory
 from unghost.prior.training.batches import Mixture

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -90,8 +91,5 @@ ABLATION: dict[str, Callable[[Job], list[Outcome]]] = {
     "ours": restoration,
     "ours, cubes drawn uniformly": lambda job: restoration(job, strategy="uniform"),
     "ours, by densities": lambda job: restoration(job, strategy="importance"),
-    **{
-        f"ours, edges {name}": (lambda job, edges=edges: restoration(job, edge_range=edges))
-        for name, edges in EDGES.items()
-    },
+    **{f"ours, edges {name}": partial(restoration, edge_range=edges) for name, edges in EDGES.items()},
 }

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -101,16 +102,36 @@ class Job:
         return TrainingConfig(rays=self.scene.rays, sampling=self.scene.sampling)
 
 
+class Spent(TypedDict):
+    """Seconds by the clock and of all threads together, as the fields of :class:`Outcome` are called."""
+
+    seconds: float
+    cpu_seconds: float
+
+
 class Clock:
     """Seconds since it was made, as the fields of :class:`Outcome` are called."""
 
     def __init__(self) -> None:
         self._begun = time.perf_counter(), time.process_time()
 
-    def read(self) -> dict[str, float]:
+    def read(self) -> Spent:
         """By the clock, and of all threads together."""
         now = time.perf_counter(), time.process_time()
         return {"seconds": now[0] - self._begun[0], "cpu_seconds": now[1] - self._begun[1]}
+
+
+def add_seconds(before: Outcome, after: Spent) -> Spent:
+    """Seconds of an outcome and of what came after it."""
+    return {
+        "seconds": before.seconds + after["seconds"],
+        "cpu_seconds": before.cpu_seconds + after["cpu_seconds"],
+    }
+
+
+def total(losses: Iterable[Tensor]) -> Tensor:
+    """Sum of scalar losses; 0 for none."""
+    return sum(losses, torch.zeros(()))
 
 
 def render(outcome: Outcome, scene: TrajectoryScene, cameras: Cameras, *, values: bool = True) -> Views:
@@ -162,7 +183,7 @@ def fine_tuned(
     parts: list[Term] = list(terms)
     watched = None
     if regularizer is not None:
-        parts.insert(0, lambda field, step: sum(regularizer(field.density_fn).values()))
+        parts.insert(0, lambda field, step: total(regularizer(field.density_fn).values()))
         watched = regularizer.observe if observed and regularizer.settings.dsds_weight > 0 else None
     left = None if job.seconds is None else max(job.seconds - clock.read()["seconds"], 1e-3)
     budget: dict[str, Any] = {"steps": job.steps} if left is None else {"seconds": left}
@@ -174,7 +195,7 @@ def fine_tuned(
         config=config or job.fitting,
         fine_tune=True,
         observer=watched,
-        regularizer=(lambda field, step: sum(part(field, step) for part in parts)) if parts else None,
+        regularizer=(lambda field, step: total(part(field, step) for part in parts)) if parts else None,
         **budget,
     )
     return Outcome(tuned, **clock.read(), steps=record["steps"], note=note)

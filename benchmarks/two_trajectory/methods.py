@@ -25,7 +25,7 @@ from unghost.fields.filtered import FilteredField
 from unghost.regularizer.removal import RemovalLoss
 from unghost.regularizer.settings import RegularizerSettings
 
-from .job import Clock, Job, Outcome, Term, fine_tuned, make_regularizer, visibility
+from .job import Clock, Job, Outcome, Term, add_seconds, fine_tuned, make_regularizer, visibility
 from .rivals import free_space, regnerf, sparsity, total_variation
 
 PAPER_PRIOR = Path(__file__).parents[1] / "weights" / "small-epsilon.onnx"
@@ -88,11 +88,6 @@ def _doubted(outcome: Outcome) -> Outcome:
     return dataclasses.replace(outcome, asks_photos=True)
 
 
-def _sum(before: Outcome, clock: Clock) -> dict[str, float]:
-    """Seconds of an outcome and of what came after it."""
-    return {name: value + getattr(before, name) for name, value in clock.read().items()}
-
-
 def paper_timestep(step: int) -> int:
     """The paper's t in [10, 50], anew each step."""
     return int(np.random.default_rng([step, 15]).integers(PAPER_TIMESTEPS[0], PAPER_TIMESTEPS[1] + 1))
@@ -138,7 +133,7 @@ def bayes_rays(job: Job, base: Any) -> list[Outcome]:
 def _visibility_and_bayes_rays(job: Job) -> list[Outcome]:
     tuned = once(job, "visibility")
     found, *_ = bayes_rays(job, tuned.field)
-    spent = {name: getattr(tuned, name) + getattr(found, name) for name in ("seconds", "cpu_seconds")}
+    spent = add_seconds(tuned, {"seconds": found.seconds, "cpu_seconds": found.cpu_seconds})
     return [dataclasses.replace(found, **spent, steps=tuned.steps, knob=None)]
 
 
@@ -182,7 +177,7 @@ def _clean_after(name: str) -> Callable[[Job], list[Outcome]]:
         tuned = once(job, name)
         clock = Clock()
         (found,) = cleaned(job, tuned.field, strengths=STRENGTHS[:1])
-        return [dataclasses.replace(found, **_sum(tuned, clock), steps=tuned.steps, knob=None)]
+        return [dataclasses.replace(found, **add_seconds(tuned, clock.read()), steps=tuned.steps, knob=None)]
 
     return method
 

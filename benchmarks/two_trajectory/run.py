@@ -106,7 +106,7 @@ class Options:
         """Methods of the table; those that do not train have nothing to do with equal seconds."""
         if self.ablation:
             return tuple(ABLATION)
-        left_out = (*UNTRAINED, REFERENCE) if self.equal_seconds else ()
+        left_out: tuple[str, ...] = (*UNTRAINED, REFERENCE) if self.equal_seconds else ()
         left_out += FEWER_SEEDS if seed > 0 else ()
         return tuple(name for name in self.methods if name not in left_out)
 

@@ -209,11 +209,11 @@ def synthetic_scene(
 def captured_scene(folder: Path, train: str, evaluation: str, *, downscale: float) -> TrajectoryScene:
     """A real capture."""
     capture = load_capture(folder, downscale=downscale)
-    sweeps = [
+    first, second = (
         Sweep(capture.cameras.select(chosen), capture.images(chosen))
         for chosen in (capture.split(train), capture.split(evaluation))
-    ]
+    )
     if set(capture.split(train)) & set(capture.split(evaluation)):
         raise ValueError(f"{train} and {evaluation} share photos")
     name = f"{folder.resolve().name} {train} to {evaluation} at 1:{downscale:g}"
-    return TrajectoryScene(name, *sweeps, 160, Sampling(), 4096)
+    return TrajectoryScene(name, first, second, 160, Sampling(), 4096)

@@ -23,7 +23,7 @@ from unghost.evaluation.scoring.views import Renders, Truth
 from unghost.evaluation.uncertainty.photometric import photo_doubt
 from unghost.evaluation.uncertainty.sparsification import sparsify
 
-from .job import Clock, Outcome, Views, render
+from .job import Clock, Outcome, Spent, Views, add_seconds, render
 from .scenes import LabelledSpace, TrajectoryScene
 
 CONVENTION = "proper"
@@ -67,7 +67,7 @@ def scored(
     row["curves"], row["ause"] = {}, {}
     clock = Clock()
     doubts = _doubts(stage, outcome, views, renders, headline)
-    took = clock.read() if outcome.asks_photos else dict.fromkeys(clock.read(), 0.0)
+    took: Spent = clock.read() if outcome.asks_photos else {"seconds": 0.0, "cpu_seconds": 0.0}
     for name, doubt in doubts.items():
         if name == "own" and doubt is doubts["spread"]:
             continue
@@ -80,8 +80,13 @@ def scored(
         row["conventions"] = {name: each.means() for name, each in under.items() if each.images}
     if space is not None:
         row |= space.scores(outcome.field)
-    spent = {name: getattr(outcome, name) + took[name] for name in took}
-    return {**row, **spent, "trained_steps": outcome.steps, "knob": outcome.knob, "note": outcome.note}
+    return {
+        **row,
+        **add_seconds(outcome, took),
+        "trained_steps": outcome.steps,
+        "knob": outcome.knob,
+        "note": outcome.note,
+    }
 
 
 def _doubts(stage: Stage, outcome: Outcome, views: Views, renders: Renders, headline: bool) -> dict[str, NDArray[Any]]:

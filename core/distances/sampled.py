@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..interpolate import interpolate_grid
+
 Array = NDArray[Any]
 
 
@@ -54,19 +56,9 @@ class SampledDistance:
 
     def __call__(self, positions: Array) -> Array:
         """Signed distance ``(...)`` at ``positions (..., 3)``, in the grid's coordinates."""
-        shape = np.array(self.values.shape)
         place = (np.asarray(positions, dtype=np.float64).reshape(-1, 3) - self.low) / self.pitch
-        within = np.clip(place, 0.0, shape - 1.0)
-        first = np.minimum(within.astype(np.int64), shape - 2)
-        share = within - first
-        flat, (_, rows, columns) = self.values.reshape(-1), self.values.shape
-        base = (first[:, 0] * rows + first[:, 1]) * columns + first[:, 2]
-        x, y, z = share.T
-        result = np.zeros(len(place))
-        for i, along_x in ((0, 1.0 - x), (1, x)):
-            for j, along_y in ((0, 1.0 - y), (1, y)):
-                row = base + (i * rows + j) * columns
-                result += along_x * along_y * ((1.0 - z) * flat[row] + z * flat[row + 1])
+        within = np.clip(place, 0.0, np.array(self.values.shape) - 1.0)
+        result: Array = interpolate_grid(self.values, within, dtype=np.float64)
         beyond = np.linalg.norm(place - within, axis=1) * self.pitch
         out = beyond > 0
         result[out] = np.maximum(result[out] - beyond[out], beyond[out])

@@ -13,7 +13,7 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,8 @@ SURROUNDINGS_EDGE = 3.0  # edges of the cube
 MAX_VIEW_COUNT = 255
 TRANSMITTANCE_RESOLUTION = 16
 NO_SOURCE = -1
+ShardKind = Literal["pairs", "harvest"]  # made by corruption (or of true scenes), or cut out of fitted fields
+SHARD_KINDS: tuple[ShardKind, ...] = get_args(ShardKind)
 Layout = dict[str, tuple[tuple[int, ...], str]]
 ARRAYS: Layout = {
     "inputs": ((RESOLUTION,) * 3, "uint8"),
@@ -112,7 +114,19 @@ def _check_values(arrays: Mapping[str, NDArray[Any]], provenance: Mapping[str, A
         _check_sources(arrays["source"], provenance, where)
 
 
-def write_shard(folder: str | Path, arrays: Mapping[str, NDArray[Any]], provenance: Mapping[str, Any]) -> None:
+def _check_kind(kind: object, where: str) -> ShardKind:
+    if kind not in SHARD_KINDS:
+        raise ValueError(f"{where}: kind must be one of {', '.join(SHARD_KINDS)}, got {kind!r:.80}")
+    return kind
+
+
+def write_shard(
+    folder: str | Path,
+    arrays: Mapping[str, NDArray[Any]],
+    provenance: Mapping[str, Any],
+    *,
+    kind: ShardKind = "pairs",
+) -> None:
     """Write a whole shard or nothing.
 
     Args:
@@ -126,13 +140,16 @@ def write_shard(folder: str | Path, arrays: Mapping[str, NDArray[Any]], provenan
             camera gets, see :mod:`unghost.core.visibility.transmittance`), ``frames (N, 13) float64``
             (:func:`pack_frame`), ``source (N,) int32`` (a row of ``provenance["sources"]``, -1 for none).
         provenance: JSON-able; kept in the manifest.
+        kind: ``harvest`` for cubes of fitted fields, ``pairs`` for all others; training treats them differently.
 
     Raises:
         FileExistsError: the folder is there.
-        ValueError: an array is missing, unknown or of the wrong kind; a frame or source breaks its rule.
+        ValueError: an array is missing, unknown or of the wrong dtype or shape; a frame or source breaks its rule; an
+            unknown kind.
         OSError: it cannot be written (a full disk, no permission); nothing is left behind.
     """
     target = Path(folder)
+    _check_kind(kind, "write_shard")
     if target.exists():
         raise FileExistsError(f"write_shard: {target} exists already")
     missing, unknown = sorted(set(ARRAYS) - set(arrays)), sorted(set(arrays) - set(ARRAYS) - set(OPTIONAL_ARRAYS))
@@ -155,6 +172,7 @@ def write_shard(folder: str | Path, arrays: Mapping[str, NDArray[Any]], provenan
             "format": FORMAT,
             "format_version": FORMAT_VERSION,
             "count": count,
+            "kind": kind,
             "sha256": {name: _sha256(partial / f"{name}.npy") for name in layout},
             "provenance": dict(provenance),
         }
@@ -171,7 +189,11 @@ def write_shard(folder: str | Path, arrays: Mapping[str, NDArray[Any]], provenan
 
 @dataclass(frozen=True)
 class Shard:
-    """Memory-mapped arrays of one shard; see :func:`write_shard` for shapes. Optional arrays are None when absent."""
+    """Memory-mapped arrays of one shard; see :func:`write_shard` for shapes. Optional arrays are None when absent.
+
+    Attributes:
+        kind: ``harvest`` for cubes of fitted fields, ``pairs`` for all others.
+    """
 
     inputs: NDArray[np.uint8]
     labels: NDArray[np.uint8]
@@ -184,6 +206,7 @@ class Shard:
     transmittance: NDArray[np.uint8] | None = None
     frames: NDArray[np.float64] | None = None
     source: NDArray[np.int32] | None = None
+    kind: ShardKind = "pairs"
 
     def __len__(self) -> int:
         return len(self.inputs)
@@ -211,6 +234,9 @@ def _read_manifest(source: Path) -> dict[str, Any]:
             f"read_shard: the arrays of {source} and the sha256 of its manifest disagree: "
             f"not named {missing + unlisted}, unknown {unknown}"
         )
+    if "kind" not in found:  # written before 0.2, when the recipe in the provenance told harvests apart
+        found["kind"] = "harvest" if found["provenance"].get("recipe") == "harvest" else "pairs"
+    _check_kind(found["kind"], f"read_shard: {source}/manifest.json")
     return found
 
 
@@ -248,4 +274,4 @@ def read_shard(folder: str | Path, *, verify: bool = False) -> Shard:
             raise ValueError(f"read_shard: {path} does not match the hash in its manifest")
     checked = {name: array for name, array in loaded.items() if verify or name == "source"}
     _check_values(checked, manifest["provenance"], f"read_shard: {source}")
-    return Shard(**loaded, provenance=manifest["provenance"])
+    return Shard(**loaded, provenance=manifest["provenance"], kind=manifest["kind"])

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras import Cameras
+from ..interpolate import interpolate_grid
 
 FAN = (32, 24)  # rays across and down a photo
 STEPS = 96  # samples along a ray
@@ -100,19 +101,9 @@ class TransmittanceMaps:
 
     def _look_up(self, index: int, pixels: NDArray[np.float64], distance: NDArray[np.float64]) -> NDArray[np.float32]:
         """Trilinear between the four rays about ``pixels (n, 2)`` and the two samples about ``distance (n,)``."""
-        _, height, width, count = self.through.shape
-        places = (
-            (np.interp(pixels[:, 1], self.rows, np.arange(height)), height),
-            (np.interp(pixels[:, 0], self.columns, np.arange(width)), width),
-            (np.clip(distance / self.step[index], 0.0, count - 1.0), count),
-        )
-        first = [np.minimum(place.astype(np.int64), max(size - 2, 0)) for place, size in places]
-        share = [(place - start).astype(np.float32) for (place, _), start in zip(places, first)]
-        following = [np.minimum(start + 1, size - 1) for start, (_, size) in zip(first, places)]
-        flat, result = self.through[index].reshape(-1), np.zeros(len(distance), dtype=np.float32)
-        for row, down in ((first[0], 1 - share[0]), (following[0], share[0])):
-            for column, across in ((first[1], 1 - share[1]), (following[1], share[1])):
-                base = (row * width + column) * count
-                weight = down * across
-                result += weight * ((1 - share[2]) * flat[base + first[2]] + share[2] * flat[base + following[2]])
-        return np.minimum(result, np.float32(1.0))
+        _, height, width, _ = self.through.shape
+        row = np.interp(pixels[:, 1], self.rows, np.arange(height))
+        column = np.interp(pixels[:, 0], self.columns, np.arange(width))
+        places = np.stack([row, column, distance / self.step[index]], axis=1)
+        result: NDArray[np.float32] = np.minimum(interpolate_grid(self.through[index], places), np.float32(1.0))
+        return result

@@ -247,7 +247,7 @@ def _work(
         arrays, provenance = (harvest_scene if fit else room_scene)(seed, index, config, mesh_root)
     except (RuntimeError, FloatingPointError) as error:  # no free path, a failed fit: reported, not fatal
         return index, str(error)
-    write_shard(target, arrays, provenance)
+    write_shard(target, arrays, provenance, kind="harvest" if fit else "pairs")
     return index, ""
 
 

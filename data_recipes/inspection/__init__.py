@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from .drawing import png_bytes as png_bytes
     from .drawing import render_cube as render_cube
     from .preview import draw_pair as draw_pair
-    from .preview import find_shards as find_shards
     from .preview import write_preview as write_preview
     from .statistics import FEATURES as FEATURES
     from .statistics import CubeStatistics as CubeStatistics
@@ -28,7 +27,7 @@ __getattr__, __dir__, __all__ = attach(
     __name__,
     {
         ".drawing": ["GHOST", "MISSING", "SURFACE", "UNJUDGED", "best_turn", "png_bytes", "render_cube"],
-        ".preview": ["draw_pair", "find_shards", "write_preview"],
+        ".preview": ["draw_pair", "write_preview"],
         ".statistics": [
             "CubeStatistics",
             "FEATURES",

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.occupancy import DEFAULT_OPACITY_THRESHOLD, FREE_LABEL, IGNORE_LABEL, SURFACE_LABEL, opacity_from_signed
+from ...core.shards.finding import find_shards
 from ...core.shards.packing import dequantize_signed, unpack_labels
 from ...core.shards.storage import Shard, read_shard
 from .drawing import GHOST, MISSING, SURFACE, UNJUDGED, Image, best_turn, render_cube
@@ -35,21 +36,6 @@ class DrawnCube:
     edge_fraction: float
     shard: str
     row: int
-
-
-def find_shards(folder: str | Path) -> list[Path]:
-    """The shard ``folder``, or the shards in it, in order of their names; unfinished ones (``.partial``) are left out.
-
-    Raises:
-        ValueError: neither a shard nor a folder with one.
-    """
-    root = Path(folder)
-    if (root / "manifest.json").is_file():
-        return [root]
-    found = sorted(path.parent for path in root.glob("*/manifest.json") if path.parent.suffix != ".partial")
-    if not found:
-        raise ValueError(f"find_shards: {root} is not a shard and holds none")
-    return found
 
 
 def draw_pair(signed: NDArray[np.floating], labels: NDArray[np.uint8], *, width: int = 168) -> tuple[Image, Image]:

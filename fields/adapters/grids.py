@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...core.aabb import as_aabb
+from ...core.interpolate import interpolate_grid
 from ...core.lattice import cell_centers as cell_centers
 from ...core.lattice import cell_pitch as cell_pitch
 
@@ -34,28 +35,17 @@ def grid_density_fn(density: NDArray[Any], aabb: ArrayLike) -> DensityFn:
         >>> field(np.array([[1.0, 0.5, 0.5]])).item()
         2.0
     """
-    values = np.asarray(density, dtype=np.float32)
+    values = np.ascontiguousarray(density, dtype=np.float32)
     if values.ndim != 3 or 0 in values.shape:
         raise ValueError(f"grid_density_fn: density must have shape (X, Y, Z), got {values.shape}")
     box = as_aabb(aabb, caller="grid_density_fn")
     shape = np.array(values.shape)
-    strides = np.array([shape[1] * shape[2], shape[2], 1])
-    flat = values.ravel()
 
     def density_fn(positions: NDArray[Any]) -> NDArray[np.float32]:
         points = np.asarray(positions, dtype=np.float64)
         inside = ((points >= box[0]) & (points <= box[1])).all(axis=-1)
-        where = np.clip((points - box[0]) / (box[1] - box[0]) * shape - 0.5, 0.0, shape - 1.0)
-        low = np.minimum(np.floor(where).astype(np.int64), np.maximum(shape - 2, 0))
-        share = (where - low).astype(np.float32)
-        step = np.where(shape > 1, strides, 0)
-        base = low @ strides
-        total = np.zeros(points.shape[:-1], dtype=np.float32)
-        shares = [(1.0 - share[..., axis], share[..., axis]) for axis in range(3)]
-        for corner in np.ndindex(2, 2, 2):
-            weight = shares[0][corner[0]] * shares[1][corner[1]] * shares[2][corner[2]]
-            total += weight * flat[base + int(np.dot(corner, step))]
-        return np.where(inside, total, np.float32(0.0))[..., None]
+        density = interpolate_grid(values, (points - box[0]) / (box[1] - box[0]) * shape - 0.5)
+        return np.where(inside, density, np.float32(0.0))[..., None]
 
     return density_fn
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections import deque
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,16 +46,13 @@ def apply_symmetry(grid: NDArray[Any], symmetry: int) -> NDArray[Any]:
 
 
 BLIND_SEVERITY = 0.8
-HARVEST_RECIPE = "harvest"  # what the provenance of cubes of fitted fields says
-
-
 ANY_EDGE = (0.01, 2.0)  # edge fractions that fields are cleaned at
 FINER = 8.0  # a field may have so many times the cells, along an axis, of those that were harvested
 DEPTH_JITTER = 0.5  # of the logarithm of a harvested cube's optical depth: a field's cell is known but roughly
 
 
 def _harvested(shard: Shard) -> bool:
-    return bool(shard.provenance.get("recipe") == HARVEST_RECIPE)
+    return shard.kind == "harvest"
 
 
 def any_edge(rng: np.random.Generator) -> float:
@@ -210,7 +207,7 @@ class Mixture:
             np.array([_harvested(d.shard) for d in draws]),
         )
 
-    def stream(self, first_step: int, batch_size: int, *, ahead: int = 2) -> Iterator[Batch]:
+    def stream(self, first_step: int, batch_size: int, *, ahead: int = 2) -> Generator[Batch, None, None]:
         """Batches ``first_step``, ``first_step + 1``, … for ever, ``ahead`` of them prepared in threads."""
         with ThreadPoolExecutor(max_workers=max(1, ahead)) as pool:
             pending: deque[Future[Batch]] = deque()

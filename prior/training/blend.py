@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -29,7 +29,7 @@ class Pairs(Protocol):
 class PairSource(Protocol):
     """Something that makes pairs for ever: batch s of size n holds its samples ``s n`` to ``(s + 1) n - 1``."""
 
-    def stream(self, first_step: int, batch_size: int) -> Iterator[Any]:
+    def stream(self, first_step: int, batch_size: int) -> Generator[Any, None, None]:
         """Batches ``first_step``, ``first_step + 1``, …, each one :class:`Pairs`; closing it ends its workers."""
 
 
@@ -113,7 +113,7 @@ class Blend:
             parts = [part.source.stream(first_step, count) for part, count in zip(self.online, self.counts[1:])]
             shards = None if self.mixture is None else self.mixture.stream(first_step, self.counts[0])
             for part in (*parts, *([] if shards is None else [shards])):
-                stack.enter_context(closing(part))  # type: ignore[type-var]
+                stack.enter_context(closing(part))
             for step in itertools.count(first_step):
                 made = [self._completed(next(part), step, number) for number, part in enumerate(parts, 1)]
                 yield join_batches([*([] if shards is None else [next(shards)]), *made])

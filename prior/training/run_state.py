@@ -114,7 +114,7 @@ class Trainer:
             group["lr"] = rate
         loss = self._losses(batch).mean()
         self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()
         loss = self.group.average(self.network, loss)
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), self.config.gradient_clip)
         values = {"loss": loss.item(), "gradient_norm": float(norm), "learning_rate": rate}

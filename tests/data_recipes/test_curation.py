@@ -110,6 +110,7 @@ def test_procedural_cubes_say_where_they_lay_and_are_nobodys(tmp_path):
     shard = read_shard(curate(recipe, tmp_path, count=12, seed=0)[0], verify=True)
     assert shard.source is shard.surroundings is shard.view_count is None
     assert "sources" not in shard.provenance
+    assert shard.kind == "pairs"
     assert shard.provenance["licence"] == "generated"
     for index, (numbers, fraction) in enumerate(zip(shard.frames, shard.edge_fraction)):
         _, wanted, frame = sample_cube(np.random.default_rng([0, index]), recipe)

@@ -136,6 +136,31 @@ def test_what_is_allowed_passes(source, path):
     assert violations(source, path) == []
 
 
+def imports_of_the_command_line(source):
+    """Imports of ``unghost.cli``, however they are written, in a module outside it."""
+    imports = (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Import | ast.ImportFrom))
+    found = [
+        f"{'.' * getattr(node, 'level', 0)}{getattr(node, 'module', '') or ''}.{alias.name}"
+        for node in imports
+        for alias in node.names
+    ]
+    return [name for name in found if "cli" in name.replace("unghost.", ".").strip(".").split(".")[:1]]
+
+
+@pytest.mark.parametrize("folder", [*ALLOWED, "benchmarks", "examples"])
+def test_only_the_command_line_imports_the_command_line(folder):
+    for path in sorted((ROOT / folder).rglob("*.py")):
+        if "cli" not in path.parts and not any(parent.is_symlink() for parent in path.parents):
+            assert imports_of_the_command_line(path.read_text(encoding="utf-8")) == [], path
+
+
+def test_imports_of_the_command_line_are_seen():
+    for line in ("from unghost.cli.training import x", "from .cli.training import x", "from ..cli import x"):
+        assert imports_of_the_command_line(line)
+    assert imports_of_the_command_line("from unghost import cli")
+    assert imports_of_the_command_line("from .client import cli_name") == []
+
+
 def test_no_folder_is_forgotten():
     on_disk = {path.parent.name for path in ROOT.glob("*/__init__.py")} - {"benchmarks"}
     assert on_disk == set(ALLOWED)

@@ -1,6 +1,7 @@
 """What the documents promise is what the code has."""
 
 import dataclasses
+import json
 import re
 from pathlib import Path
 
@@ -49,6 +50,7 @@ def test_the_sample_of_the_harvest_is_whole_small_and_ours():
     shard = read_shard(folder, verify=True)
     assert len(set(shard.group.tolist())) == len(shard) == 8
     assert {scene["field"] for scene in shard.provenance["scenes"]} == {"dense", "hash"}
+    assert shard.kind == json.loads((folder / "manifest.json").read_text(encoding="utf-8"))["kind"] == "harvest"
     assert shard.provenance["licence"] == "generated"
     for name in ("surroundings", "view_count", "transmittance", "frames"):
         assert getattr(shard, name) is not None, name

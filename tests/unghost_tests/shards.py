@@ -57,7 +57,7 @@ def shard_paths(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     root = tmp_path_factory.mktemp("shards")
     for seed, (name, count) in enumerate({"a": 12, "b": 7, "held_out": 10}.items()):
         write_shard(root / name, make_pairs(count, seed), {"seed": seed})
-    write_shard(root / "seen", make_pairs(9, 5) | make_context(9, 5), {"seed": 5, "recipe": "harvest"})
+    write_shard(root / "seen", make_pairs(9, 5) | make_context(9, 5), {"seed": 5}, kind="harvest")
     return {name: root / name for name in ("a", "b", "held_out", "seen")}
 
 

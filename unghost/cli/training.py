@@ -10,37 +10,12 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional, UseAppendAction
 
+from ..core.shards.finding import expand_shards
+
 if TYPE_CHECKING:
     from ..prior.training.config import TrainConfig
 
 ONLINE_SEED = 1 << 32  # plus the run's seed: what is made online is in no shard
-
-
-def expand_shards(spec: str) -> list[tuple[Path, float]]:
-    """``FOLDER`` or ``FOLDER=WEIGHT`` to shards and their weights.
-
-    A folder that is no shard itself stands for the shards in it, which share its weight by their length.
-
-    Raises:
-        ValueError: the weight is no positive number, or there is no shard.
-    """
-    from ..core.shards.storage import read_shard
-
-    name, separator, number = spec.rpartition("=")
-    folder = Path(name if separator else spec)
-    try:
-        weight = float(number) if separator else 1.0
-    except ValueError:
-        raise ValueError(f"expand_shards: {spec!r} must be FOLDER or FOLDER=WEIGHT, the weight a number") from None
-    if not 0 < weight < float("inf"):
-        raise ValueError(f"expand_shards: the weight in {spec!r} must be finite and > 0")
-    if (folder / "manifest.json").is_file():
-        return [(folder, weight)]
-    found = sorted(path.parent for path in folder.glob("*/manifest.json") if path.parent.suffix != ".partial")
-    if not found:
-        raise ValueError(f"expand_shards: {folder} is not a shard and holds none")
-    lengths = [len(read_shard(path)) for path in found]
-    return [(path, weight * length / sum(lengths)) for path, length in zip(found, lengths)]
 
 
 def _named_shards(specs: list[str]) -> dict[str, Path]:

@@ -250,12 +250,13 @@ def test_the_study_shows_bits_where_it_says_so_and_keeps_the_truth(parts, tmp_pa
         "group": np.arange(3, dtype=np.int32),
         "view_count": rng.integers(0, 9, (3, 32, 32, 32), dtype=np.uint8),
     }
-    write_shard(tmp_path / "shard", arrays, {"recipe": "harvest"})
+    write_shard(tmp_path / "shard", arrays, {"recipe": "by hand"}, kind="harvest")
     study = parts["study"]
     ((path, weight),) = study.bit_shards([(str(tmp_path / "shard"), 0.5)], tmp_path / "bits")
     bits = read_shard(path, verify=True)
     assert weight == 0.5
-    assert bits.provenance["recipe"] == "harvest"  # the trainer weighs harvested cubes by that
+    assert bits.kind == "harvest"  # the trainer weighs harvested cubes by that
+    assert bits.provenance == {"recipe": "by hand"}
     assert set(np.unique(bits.inputs)) == {0, 255}
     opaque = opacity_from_signed(dequantize_signed(arrays["inputs"])) > 0.1
     np.testing.assert_array_equal(np.array(bits.inputs) == 255, opaque)

@@ -41,9 +41,49 @@ def test_golden_bytes(shard):
         "format": "unghost-shard",
         "format_version": 1,
         "count": 2,
+        "kind": "pairs",
         "sha256": GOLDEN,
         "provenance": {"recipe": "test", "seed": 3},
     }
+
+
+def test_golden_manifest_of_a_harvest(tmp_path, arrays):
+    write_shard(tmp_path / "s", arrays(), {"recipe": "test"}, kind="harvest")
+    text = (tmp_path / "s" / "manifest.json").read_text(encoding="utf-8")
+    hashes = ",\n".join(f'  "{name}": "{digest}"' for name, digest in GOLDEN.items())
+    assert text == (
+        '{\n "format": "unghost-shard",\n "format_version": 1,\n "count": 2,\n "kind": "harvest",\n'
+        f' "sha256": {{\n{hashes}\n }},\n "provenance": {{\n  "recipe": "test"\n }}\n}}'
+    )
+    assert read_shard(tmp_path / "s").kind == "harvest"
+
+
+@pytest.mark.parametrize(
+    ("provenance", "kind"),
+    [
+        ({"recipe": "harvest"}, "harvest"),
+        ({"recipe": "rooms"}, "pairs"),
+        ({"recipe": {"name": "x"}}, "pairs"),
+        ({}, "pairs"),
+    ],
+)
+def test_the_kind_of_a_manifest_without_one_comes_from_its_recipe(shard, provenance, kind):
+    path = shard / "manifest.json"
+    manifest = json.loads(path.read_text(encoding="utf-8")) | {"provenance": provenance}
+    del manifest["kind"]
+    path.write_text(json.dumps(manifest), encoding="utf-8")
+    assert read_shard(shard, verify=True).kind == kind
+
+
+@pytest.mark.parametrize("kind", ["Harvest", "", None, 1, ["pairs"]])
+def test_unknown_kinds_are_refused(shard, tmp_path, arrays, kind):
+    with pytest.raises(ValueError, match="write_shard: kind must be one of pairs, harvest, got"):
+        write_shard(tmp_path / "s", arrays(), {}, kind=kind)
+    assert not (tmp_path / "s").exists()
+    path = shard / "manifest.json"
+    path.write_text(json.dumps(json.loads(path.read_text(encoding="utf-8")) | {"kind": kind}), encoding="utf-8")
+    with pytest.raises(ValueError, match=r"read_shard: .*manifest.json: kind must be one of pairs, harvest, got"):
+        read_shard(shard)
 
 
 def test_round_trip_is_memory_mapped(shard, arrays):

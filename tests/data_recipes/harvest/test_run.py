@@ -55,6 +55,7 @@ def test_one_scene_end_to_end_and_again(tmp_path):
     assert (shard.edge_fraction > 0).all()
     told = shard.provenance
     assert (told["seed"], told["scene"], told["recipe"]) == (3, 5, "harvest")
+    assert shard.kind == "harvest"
     assert told["config"] == json.loads(json.dumps(TINY.__dict__))
     # a second call finds its work done, and an unfinished folder of a killed run is not counted
     (tmp_path / "scene-00006.partial").mkdir()
@@ -209,7 +210,8 @@ def test_room_scenes_repeat_and_fit_a_shard(tmp_path):
         np.testing.assert_array_equal(arrays[name], again[name])
     assert not np.array_equal(room_scene(1, 3, TINY)[0]["inputs"], arrays["inputs"])
     assert harvest(tmp_path, scenes=1, config=TINY, fit=False) == TINY.cubes
-    assert read_shard(tmp_path / "scene-00000", verify=True).provenance["recipe"] == "rooms"
+    shard = read_shard(tmp_path / "scene-00000", verify=True)
+    assert (shard.kind, shard.provenance["recipe"]) == ("pairs", "rooms")
 
 
 KILLED = """

@@ -13,7 +13,7 @@ from unghost.core.shards.storage import Shard, read_shard, write_shard
 from unghost.data_recipes.curation import curate
 from unghost.data_recipes.inspection.drawing import MISSING, SURFACE
 from unghost.data_recipes.inspection.page import histogram
-from unghost.data_recipes.inspection.preview import draw_pair, find_shards, sources_of, write_preview
+from unghost.data_recipes.inspection.preview import draw_pair, sources_of, write_preview
 from unghost.data_recipes.recipe import Recipe
 
 VOID = {"meta", "img", "br", "link", "input", "rect", "path"}
@@ -214,16 +214,6 @@ def test_pictures_of_a_pair_show_what_is_missing():
     assert near(whole[1], SURFACE) > 150
     assert near(whole[1], MISSING) == 0
     assert near(lacking[1], MISSING) > 150
-
-
-def test_shards_are_found_and_unfinished_ones_are_not(tmp_path):
-    signed, labels = slabs(1)
-    for name in ("s1", "s0"):
-        shard_of(tmp_path / name, signed, labels, {})
-    (tmp_path / "s2.partial").mkdir()
-    (tmp_path / "s2.partial" / "manifest.json").write_text("{}", encoding="utf-8")
-    assert find_shards(tmp_path) == [tmp_path / "s0", tmp_path / "s1"]
-    assert find_shards(tmp_path / "s1") == [tmp_path / "s1"]
 
 
 def test_histogram_is_valid_svg_and_its_bars_are_the_shares():

@@ -141,8 +141,8 @@ def test_harvested_cubes_alone_get_another_depth(shard_paths, tmp_path):
         "edge_fraction": np.full(2, 0.1, dtype=np.float32),
         "group": np.zeros(2, dtype=np.int32),
     }
-    for recipe in ("harvest", "rooms"):
-        write_shard(tmp_path / recipe, arrays, {"recipe": recipe})
+    for recipe, kind in (("harvest", "harvest"), ("rooms", "pairs")):
+        write_shard(tmp_path / recipe, arrays, {"recipe": recipe}, kind=kind)
     fitted, rooms = (
         Mixture([(tmp_path / name, 1.0)], seed=0).batch(0, 40).channels[:, 0, 0, 0, 0] for name in ("harvest", "rooms")
     )
@@ -157,9 +157,11 @@ def test_harvested_cubes_are_marked(shard_paths, tmp_path):
     shard = read_shard(shard_paths["a"])
     names = ("inputs", "labels", "severity", "edge_fraction", "group")
     arrays = {name: np.array(getattr(shard, name)) for name in names}
-    write_shard(tmp_path / "fitted", arrays, {"recipe": "harvest", "scene": 3})
+    write_shard(tmp_path / "fitted", arrays, {"recipe": "by hand"}, kind="harvest")
     assert Mixture([(tmp_path / "fitted", 1.0)], seed=0).batch(0, 4).harvested.tolist() == [True] * 4
     assert Mixture([(shard_paths["a"], 1.0)], seed=0).batch(0, 4).harvested.tolist() == [False] * 4
+    write_shard(tmp_path / "named", arrays, {"recipe": "harvest"}, kind="pairs")  # the recipe is free text
+    assert Mixture([(tmp_path / "named", 1.0)], seed=0).batch(0, 4).harvested.tolist() == [False] * 4
 
 
 def test_errors(shard_paths, tmp_path):

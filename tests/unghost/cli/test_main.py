@@ -5,9 +5,7 @@ import pytest
 
 from unghost import cli
 from unghost.cli import prior as commands
-from unghost.cli.training import expand_shards
-from unghost.core.shards.packing import pack_labels
-from unghost.core.shards.storage import write_shard
+from unghost.core.shards.finding import expand_shards
 from unghost.fields.adapters.grids import load_grid, save_grid
 
 VERBS = (
@@ -27,20 +25,6 @@ VERBS = (
     "export",
     "verify",
 )
-
-
-def small_shard(folder, count):
-    write_shard(
-        folder,
-        {
-            "inputs": np.zeros((count, 32, 32, 32), dtype=np.uint8),
-            "labels": pack_labels(np.zeros((count, 32, 32, 32), dtype=np.uint8)),
-            "severity": np.zeros(count, dtype=np.float32),
-            "edge_fraction": np.full(count, 0.1, dtype=np.float32),
-            "group": np.zeros(count, dtype=np.int32),
-        },
-        {},
-    )
 
 
 @pytest.mark.parametrize("words", [[], *([verb] for verb in VERBS)])
@@ -69,7 +53,7 @@ def test_wrong_words_exit_with_two(words, capsys):
         (["clean", "absent.npz", "--cameras", "absent"], "unghost clean: load_cameras: no file absent"),
         (["curate", "absent", "--out", "x"], "unghost curate: load_recipe: absent is neither a file"),
         (["curate", "procedural", "--out", "x", "--count", "0"], "unghost curate: curate: count must be >= 1, got 0"),
-        (["train", "absent", "--out", "x"], "unghost train: expand_shards: absent is not a shard and holds none"),
+        (["train", "absent", "--out", "x"], "unghost train: find_shards: absent is not a shard and holds none"),
         (["train", "absent=much", "--out", "x"], "must be FOLDER or FOLDER=WEIGHT"),
         (["demo", "--seed", "-1"], "unghost demo: "),
         (["bench", "--denoiser", "absent.onnx"], "unghost bench: load_denoiser: no file absent.onnx"),
@@ -112,20 +96,6 @@ def test_curate_writes_shards(tmp_path, capsys):
     assert cli.main(["curate", "procedural", "--out", str(tmp_path / "pairs"), "--count", "3"]) == 0
     assert "3 pairs in 1 shard under" in capsys.readouterr().out
     assert expand_shards(f"{tmp_path / 'pairs'}=2") == [(tmp_path / "pairs" / "shard-00000", 2.0)]
-
-
-def test_shards_of_a_folder_share_its_weight_by_length(tmp_path):
-    for index, count in enumerate((1, 3)):
-        small_shard(tmp_path / f"s{index}", count)
-    (tmp_path / "s2.partial").mkdir()
-    assert expand_shards(f"{tmp_path}=2") == [(tmp_path / "s0", 0.5), (tmp_path / "s1", 1.5)]
-    assert expand_shards(str(tmp_path / "s1")) == [(tmp_path / "s1", 1.0)]
-
-
-@pytest.mark.parametrize("weight", ["0", "-1", "inf", "nan"])
-def test_impossible_weights_are_refused(weight):
-    with pytest.raises(ValueError, match="must be finite and > 0"):
-        expand_shards(f"x={weight}")
 
 
 def test_grid_files_round_trip_and_refuse(tmp_path):

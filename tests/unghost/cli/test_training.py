@@ -23,7 +23,7 @@ def shard(tmp_path):
         "surroundings": rng.integers(0, 256, (4, 16, 16, 16), dtype=np.uint8),
         "view_count": rng.integers(0, 20, (4, 32, 32, 32), dtype=np.uint8),
     }
-    write_shard(tmp_path / "shard", arrays, {"recipe": "harvest"})
+    write_shard(tmp_path / "shard", arrays, {}, kind="harvest")
     return str(tmp_path / "shard")
 
 
