@@ -14,11 +14,12 @@ from typing import Any
 
 from unghost.core.channels import VIEW_COUNT
 from unghost.core.manifest import Manifest
+from unghost.core.metrics import format_value
 from unghost.export.container import precision_of
 from unghost.export.runtime import read_manifest
 from unghost.prior.networks.restoration import SIZES, RestorationNet, parameter_count
 
-from .readme import ROOT, load, number, table
+from .readme import ROOT, load, table
 
 WEIGHTS = ROOT / "unghost" / "weights"
 CALLED = {"default": "unghost"}  # in the reference measurement
@@ -159,7 +160,7 @@ def scores(name: str) -> list[str]:
             row["set"],
             str(row.get("severity", row.get("family", "–"))),
             str(row["cubes"]),
-            *(number(row[k]) for k in ("iou_before", "iou", "ghosts_removed_98", "ghosts_removed_90")),
+            *(format_value(row[k], k) for k in ("iou_before", "iou", "ghosts_removed_98", "ghosts_removed_90")),
         ]
         for row in load("denoise")["rows"]
         if row.get("model") == called and "cubes" in row and row.get("family", "mixed") in ("mixed", "bits", "soft")

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from unghost.evaluation.report.tables import METRICS
+from unghost.core.metrics import METRICS
 
 from ..compact import rounded, write_lines
 from .tables import AT_EQUAL, FROM, Cell, lowest_coverage, run_of
@@ -68,7 +68,7 @@ def compact_rows(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     for row in rows:
         known = {key: value for key, value in row.items() if value is not None and not key.startswith(UNPRINTED)}
         intervals = {
-            key: [round(end, METRICS[key].digits) for end in ends]
+            key: [round(end, METRICS[key].decimals) for end in ends]
             for key, ends in known.pop("intervals", {}).items()
             if key in METRICS and None not in ends
         }
