@@ -1,28 +1,31 @@
-"""Line charts of a report's page, as SVG: no script, no library, readable on a phone, light and dark."""
+"""Line charts and histograms of a page as plain data: where lines, bars and labels go, in SVG units.
+
+The template ``macros.html.jinja`` draws them: no script, no library, readable on a phone, light and dark.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
-from .tables import text
+import numpy as np
+from numpy.typing import NDArray
 
-COLOURS = 8  # of the style sheet; further series are dashed
-WIDTH, HEIGHT = 560, 320
-LEFT, RIGHT, TOP, BOTTOM = 52, 14, 12, 46
+COLOURS = 8  # in the style sheet; further series are dashed
 TICKS = 6  # about that many, never more
 
 
 @dataclass(frozen=True)
 class Series:
-    """One line.
+    """Line of a chart.
 
     Attributes:
         label: for the key.
         x, y: of its points, finite, in rising ``x``; a single point is drawn as a disc.
         colour: number of its colour.
-        notes: a text a point, shown on hovering.
+        notes: text of each point, shown on hovering.
     """
 
     label: str
@@ -32,59 +35,163 @@ class Series:
     notes: tuple[str, ...] = ()
 
 
-def colours_of(methods: Sequence[str]) -> Mapping[str, int]:
-    """The same colour for a method in every chart and table."""
+@dataclass(frozen=True)
+class Mark:
+    """Text at a place along an axis or at a point."""
+
+    x: float
+    y: float
+    text: str
+
+
+@dataclass(frozen=True)
+class Line:
+    """Series in SVG units, with a note for each point."""
+
+    label: str
+    colour: int
+    points: tuple[Mark, ...]
+
+
+@dataclass(frozen=True)
+class LineChart:
+    """Line chart in SVG units. ``key`` pairs colours with labels; ``dots`` draws every point."""
+
+    kind: ClassVar[str] = "lines"
+    width: ClassVar[int] = 560
+    height: ClassVar[int] = 320
+    left: ClassVar[int] = 52
+    right: ClassVar[int] = 546
+    top: ClassVar[int] = 12
+    bottom: ClassVar[int] = 274
+
+    x_label: str
+    y_label: str
+    x_ticks: tuple[Mark, ...]
+    y_ticks: tuple[Mark, ...]
+    lines: tuple[Line, ...]
+    key: tuple[tuple[int, str], ...]
+    dots: bool
+
+
+@dataclass(frozen=True)
+class Bar:
+    """Bar of a histogram in SVG units, with the share that it stands for."""
+
+    x: float
+    y: float
+    width: float
+    height: float
+    colour: int
+    share: float
+
+
+@dataclass(frozen=True)
+class Histogram:
+    """Histogram in SVG units. ``highest`` is the share of the tallest bar."""
+
+    kind: ClassVar[str] = "bars"
+    width: ClassVar[int] = 320
+    height: ClassVar[int] = 146
+    left: ClassVar[int] = 4
+    right: ClassVar[int] = 316
+    top: ClassVar[int] = 20
+    bottom: ClassVar[int] = 120
+
+    bars: tuple[Bar, ...]
+    marks: tuple[tuple[Mark, str], ...]
+    key: tuple[tuple[int, str], ...]
+    highest: float
+
+
+def colours_of(methods: Sequence[str]) -> dict[str, int]:
+    """Assign one colour number to each method, for all charts and tables of a page."""
     return {name: index for index, name in enumerate(dict.fromkeys(methods))}
 
 
-def swatch(colour: int) -> str:
-    """A small square of a series' colour."""
-    return f'<i class="swatch s{colour % COLOURS}{" dashed" if colour >= COLOURS else ""}"></i>'
+def series_class(colour: int) -> str:
+    """CSS classes of a colour number."""
+    return f"s{colour % COLOURS}{' dashed' if colour >= COLOURS else ''}"
 
 
-def line_chart(series: Sequence[Series], *, x_label: str, y_label: str, dots: bool = True) -> str:
-    """An SVG with its key; empty text if there is no point."""
+def percent(share: float) -> str:
+    """Share as a percentage: one decimal below 10 %, none above."""
+    if 0 < share < 0.0005:
+        return "< 0.1\u00a0%"
+    return f"{100 * share:.0f}\u00a0%" if share == 0 or share >= 0.0995 else f"{100 * share:.1f}\u00a0%"
+
+
+def line_chart(series: Sequence[Series], *, x_label: str, y_label: str, dots: bool = True) -> LineChart | None:
+    """Lay out a line chart.
+
+    Args:
+        series: those without points are left out; several of one colour and label (seeds) share a key entry.
+        x_label, y_label: names of the axes.
+        dots: mark every point.
+
+    Returns:
+        The chart, None if there is no point.
+    """
     drawn = [each for each in series if each.x]
     if not drawn:
-        return ""
+        return None
     x_low, x_high = _range([value for each in drawn for value in each.x])
     y_low, y_high = _range([value for each in drawn for value in each.y])
+    frame = LineChart
 
-    def place(x: float, y: float) -> tuple[float, float]:
-        return (
-            LEFT + (x - x_low) / (x_high - x_low) * (WIDTH - LEFT - RIGHT),
-            HEIGHT - BOTTOM - (y - y_low) / (y_high - y_low) * (HEIGHT - TOP - BOTTOM),
+    def place(x: float, y: float, text: str) -> Mark:
+        across = frame.left + (x - x_low) / (x_high - x_low) * (frame.right - frame.left)
+        down = frame.bottom - (y - y_low) / (y_high - y_low) * (frame.bottom - frame.top)
+        return Mark(round(across, 1), round(down, 1), text)
+
+    def line(each: Series) -> Line:
+        values = [f"{x:.4g}, {y:.4g}" for x, y in zip(each.x, each.y)]
+        notes = [*each.notes, *values[len(each.notes) :]]
+        return Line(each.label, each.colour, tuple(map(place, each.x, each.y, notes)))
+
+    return LineChart(
+        x_label=x_label,
+        y_label=y_label,
+        x_ticks=tuple(place(value, y_low, _short(value)) for value in _ticks(x_low, x_high)),
+        y_ticks=tuple(place(x_low, value, _short(value)) for value in _ticks(y_low, y_high)),
+        lines=tuple(map(line, drawn)),
+        key=tuple(dict.fromkeys((each.colour, each.label) for each in drawn)),
+        dots=dots,
+    )
+
+
+def histogram(
+    series: Mapping[str, NDArray[Any]], bins: int, marks: Mapping[float, str], *, colours: Sequence[int] = (7, 2)
+) -> Histogram:
+    """Lay out one or two distributions over the same bins, as shares of each.
+
+    Args:
+        series: one or two names to counts or weights ``(bins,)``.
+        bins: number of bins, drawn equally wide.
+        marks: position, in bins, to the text under it.
+        colours: colour numbers of the series.
+    """
+    frame = Histogram
+    shares = {name: counts / max(float(counts.sum()), 1e-12) for name, counts in series.items()}
+    highest = max(max(float(np.max(values)) for values in shares.values()), 1e-12)
+    step = (frame.right - frame.left) / bins
+    wide = step / len(shares)
+    bars = []
+    for number, values in enumerate(shares.values()):
+        for index, share in enumerate(map(float, values)):
+            tall = round((frame.bottom - frame.top) * share / highest, 1)
+            if tall > 0:
+                left = round(frame.left + index * step + number * wide, 1)
+                bars.append(Bar(left, frame.bottom - tall, round(max(wide - 1, 1), 1), tall, colours[number], share))
+    placed = tuple(
+        (
+            Mark(round(frame.left + place * step, 1), frame.bottom + 17, text),
+            "start" if place == 0 else "end" if place >= bins else "middle",
         )
-
-    parts = [
-        f'<svg class="chart" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{text(y_label)} over '
-        f'{text(x_label)}">'
-    ]
-    for value in _ticks(y_low, y_high):
-        y = place(x_low, value)[1]
-        parts.append(f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>')
-        parts.append(f'<text x="{LEFT - 7}" y="{y + 4:.1f}" text-anchor="end">{_short(value)}</text>')
-    for value in _ticks(x_low, x_high):
-        x = place(value, y_low)[0]
-        parts.append(f'<text x="{x:.1f}" y="{HEIGHT - BOTTOM + 19}" text-anchor="middle">{_short(value)}</text>')
-    parts.append(f'<text x="{(LEFT + WIDTH - RIGHT) / 2}" y="{HEIGHT - 5}" text-anchor="middle">{text(x_label)}</text>')
-    for each in drawn:
-        parts.append(_line(each, [place(x, y) for x, y in zip(each.x, each.y)], dots))
-    labels = dict.fromkeys((each.colour, each.label) for each in drawn)  # several seeds of a method share one
-    key = "".join(f"<span>{swatch(colour)}{text(label)}</span>" for colour, label in labels)
-    return "".join(parts) + f'</svg><p class="key">{key}</p>'
-
-
-def _line(series: Series, points: Sequence[tuple[float, float]], dots: bool) -> str:
-    style = f"s{series.colour % COLOURS}{' dashed' if series.colour >= COLOURS else ''}"
-    path = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
-    drawn = f'<polyline class="{style}" points="{path}"/>' if len(points) > 1 else ""
-    radius = 5 if len(points) == 1 else 3
-    for index, (x, y) in enumerate(points if dots or len(points) == 1 else []):
-        note = series.notes[index] if index < len(series.notes) else f"{series.x[index]:.4g}, {series.y[index]:.4g}"
-        title = f"<title>{text(series.label)}: {text(note)}</title>"
-        drawn += f'<circle class="{style}" cx="{x:.1f}" cy="{y:.1f}" r="{radius}">{title}</circle>'
-    return drawn
+        for place, text in marks.items()
+    )
+    key = tuple(zip(colours, shares)) if len(shares) > 1 else ()
+    return Histogram(tuple(bars), placed, key, highest)
 
 
 def _range(values: Sequence[float]) -> tuple[float, float]:
