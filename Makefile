@@ -44,7 +44,7 @@ $(MADE)/venv:
 
 # The light half: what `unghost demo` uses and nothing else.
 $(MADE)/demo: $(INPUTS) | $(MADE)/venv
-	@echo "setting up $(VENV) for the demo (numpy, onnxruntime, scipy, matplotlib; no torch) …"
+	@echo "setting up $(VENV) for the demo (numpy, onnxruntime, scipy, matplotlib, Jinja2; no torch) …"
 	@$(PIP) install --quiet $(PINS) -e '.[demo]'
 	@touch $@
 

@@ -1,4 +1,4 @@
-"""The conventions of the project, one module each. numpy only; imports nothing of ours."""
+"""The conventions of the project, one module each, and HTML pages. numpy only (``pages`` needs Jinja2 to render)."""
 
 from __future__ import annotations
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import io
 import math
 from collections.abc import Mapping, Sequence
@@ -16,7 +15,7 @@ from ...core.metrics import get_metric
 from ..metrics.checks import Mask
 from ..scoring.renders import Method
 from ..scoring.views import Truth
-from .tables import EQUAL_KEYS, OWN_KEYS, number, text
+from .tables import EQUAL_KEYS, OWN_KEYS, number
 
 LARGEST_SIDE = 1200  # pixels; larger pictures are shrunk for the page
 COARSE = 320  # pixels across; smaller ones are shown with their pixels as squares
@@ -120,36 +119,6 @@ def jpeg(image: NDArray[Any]) -> bytes:
     stream = io.BytesIO()
     picture.save(stream, format="JPEG", quality=QUALITY, subsampling=0)
     return stream.getvalue()
-
-
-def image_tag(data: bytes, alt: str) -> str:
-    """An ``<img>`` that holds its JPEG itself."""
-    return f'<img alt="{text(alt)}" src="data:image/jpeg;base64,{base64.b64encode(data).decode("ascii")}">'
-
-
-def wipe(view: ViewPictures, left: str, right: str, number_of_view: int) -> str:
-    """One view: two pictures under a slider, then all of them with their errors and numbers."""
-    title = f"{number_of_view}. {view.name}"
-    thumbs = [
-        f'<figure data-label="{text(PHOTO)}">{image_tag(view.shown[PHOTO], f"{view.name}: photo")}'
-        f"<figcaption><b>{PHOTO}</b></figcaption></figure>"
-    ]
-    for method, data in view.errors.items():
-        alt = f"{view.name}: {method}"
-        thumbs.append(
-            f'<figure data-label="{text(method)}">{image_tag(view.shown[method], alt)}'
-            f"<figcaption><b>{text(method)}</b> {text(view.captions[method])}</figcaption></figure>"
-            f'<figure class="error">{image_tag(data, alt + ", error")}'
-            f"<figcaption>error of {text(method)}</figcaption></figure>"
-        )
-    return (
-        f'<section class="view{" coarse" if view.coarse else ""}"><h3>{text(title)}</h3>'
-        f'<div class="wipe">{image_tag(view.shown[right], f"{view.name}: {right}")}'
-        f'<div class="top">{image_tag(view.shown[left], f"{view.name}: {left}")}</div>'
-        f'<input type="range" min="0" max="100" value="50" aria-label="{text(f"{left} or {right}, {view.name}")}">'
-        f'<div class="bar"></div><em class="left">{text(left)}</em><em class="right">{text(right)}</em></div>'
-        f'<div class="choose" hidden></div><div class="thumbs">{"".join(thumbs)}</div></section>'
-    )
 
 
 def _caption(row: Mapping[str, Any], keys: Sequence[str]) -> str:

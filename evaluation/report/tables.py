@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import html
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ...core.metrics import METRICS, Metric
+from ...core.pages import Cell, Table
 from ..scoring.conventions import one_convention
 
 OWN_KEYS = (
@@ -40,11 +40,6 @@ LABEL_KEYS = ("scene", "seed")
 ARROWS = {1: "\N{NO-BREAK SPACE}↑", -1: "\N{NO-BREAK SPACE}↓", 0: ""}
 
 
-def text(value: Any) -> str:
-    """Anything as HTML text."""
-    return html.escape(str(value), quote=True)
-
-
 def number(value: Any, digits: int, *, infinite: bool = False) -> str:
     """A number, ∞ where the stored null stands for it, a dash for none."""
     if value is None or isinstance(value, str):
@@ -56,22 +51,9 @@ def number(value: Any, digits: int, *, infinite: bool = False) -> str:
 
 
 def heading(key: str, more: str = "") -> str:
-    """A metric's label, what is to be said of it, and an arrow towards better."""
+    """A metric's label, ``more`` about it, and an arrow towards better."""
     known = METRICS.get(key)
-    return text(key + more) if known is None else text(known.label + more + ARROWS[known.sign])
-
-
-def table(heads: Sequence[str], rows: Sequence[Sequence[str]], *, kind: str = "") -> str:
-    """A table of cells that are HTML already; it scrolls sideways where the screen is narrow."""
-    top = "".join(f'<th scope="col">{head}</th>' for head in heads)
-    body = "".join(
-        "<tr>"
-        + "".join(f"<td>{cell}</td>" if n else f'<th scope="row">{cell}</th>' for n, cell in enumerate(row))
-        + "</tr>"
-        for row in rows
-    )
-    inner = f"<table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table>"
-    return f'<div class="scroll {kind}" tabindex="0">{inner}</div>'
+    return key + more if known is None else known.label + more + ARROWS[known.sign]
 
 
 def by_convention(rows: Sequence[Mapping[str, Any]]) -> dict[Any, list[Mapping[str, Any]]]:
@@ -88,35 +70,35 @@ def present(rows: Sequence[Mapping[str, Any]], keys: Sequence[str], *, at_least:
 
 
 def score_table(
-    rows: Sequence[Mapping[str, Any]], keys: Sequence[str], swatch: Callable[[str], str] | None = None
-) -> str:
-    """Methods by metrics, the interval below its mean; rows of two conventions are refused, LPIPS on two backbones
-    stands in two columns.
+    rows: Sequence[Mapping[str, Any]], keys: Sequence[str], colours: Mapping[str, int] | None = None
+) -> Table | None:
+    """Table of methods by metrics, the interval below its mean.
+
+    Rows of two conventions are refused; LPIPS on two backbones stands in two columns.
 
     Args:
         rows: of one convention.
         keys: the columns; those without any number are left out.
-        swatch: HTML before a method's name, as the charts colour it.
+        colours: method -> colour number of the charts, shown before its name; None shows none.
+
+    Returns:
+        The table, None if no column has a number.
     """
     one_convention("score_table", rows)
-    columns, labels = (
-        _columns(rows, present(rows, keys)),
-        [key for key in LABEL_KEYS if any(key in row for row in rows)],
-    )
+    columns = _columns(rows, present(rows, keys))
+    labels = [key for key in LABEL_KEYS if any(key in row for row in rows)]
     if not columns:
-        return ""
-    cells = []
-    for row in rows:
-        name = text(row["method"])
-        cells.append(
-            [
-                name if swatch is None else swatch(str(row["method"])) + name,
-                *(text("–" if row.get(key) is None else row[key]) for key in labels),
-                *(_score(row, key) if _same_backbone(row, key, backbone) else "–" for key, backbone in columns),
-            ]
-        )
+        return None
+    cells: list[list[str | Cell]] = [
+        [
+            Cell(str(row["method"]), series=None if colours is None else colours[str(row["method"])]),
+            *("–" if row.get(key) is None else str(row[key]) for key in labels),
+            *(_score(row, key) if _same_backbone(row, key, backbone) else Cell("–") for key, backbone in columns),
+        ]
+        for row in rows
+    ]
     heads = [heading(key, "" if backbone is None else f" ({backbone})") for key, backbone in columns]
-    return table(["method", *labels, *heads], cells)
+    return Table(["method", *labels, *heads], cells)
 
 
 def _columns(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> list[tuple[str, str | None]]:
@@ -132,45 +114,69 @@ def _same_backbone(row: Mapping[str, Any], key: str, backbone: str | None) -> bo
     return key != "lpips" or row.get("lpips_backbone") == backbone
 
 
-def difference_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Paired differences, a line a metric; an interval without 0 is marked."""
+def difference_table(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """Table of paired differences, one line per metric; an interval without 0 is marked."""
     one_convention("difference_table", rows)
-    cells = []
+    cells: list[list[str | Cell]] = []
     for row in rows:
         known = METRICS.get(row["metric"], Metric(row["metric"], row["metric"], "none"))
         low, high, mean = row["low"], row["high"], row["difference"]
-        verdict = "one image" if low is None else "no difference shown"
+        verdict, style = "one image" if low is None else "no difference shown", "weak"
         if low is not None and (low > 0 or high < 0):
             verdict = ("better" if mean * known.sign > 0 else "worse") if known.sign else "differs"
+            style = verdict if known.sign else ""
         interval = "–" if low is None else f"{_signed(low, known.decimals)} … {_signed(high, known.decimals)}"
         cells.append(
             [
-                f"{text(row['method'])} − {text(row['against'])}",
-                text(known.label),
+                f"{row['method']} − {row['against']}",
+                known.label,
                 _signed(mean, known.decimals),
                 interval,
-                f'<span class="verdict {verdict.split()[0]}">{verdict}</span>',
+                Cell(verdict, style=style),
                 str(row["images"]),
             ]
         )
-    return table(["", "metric", "difference", "interval", "", "views"], cells, kind="names verdicts")
+    return Table(["methods", "metric", "difference", "interval", "verdict", "views"], cells, text_columns=(1, 4))
 
 
-def convention_table(rows: Sequence[Mapping[str, Any]], own: str | None) -> str:
-    """One method's renders under each convention: a line a convention, a column a metric, never averaged."""
+def point_table(rows: Sequence[Mapping[str, Any]]) -> Table | None:
+    """Table of how far PSNR-over-coverage curves are ahead of single points, None without rows."""
+    if not rows:
+        return None
+    heads = ["curve", "point", "coverage of the point", "PSNR of the curve there", "of the point", "ahead by, dB"]
+    cells = [
+        [
+            str(row["method"]),
+            str(row["point"]),
+            number(row["coverage"], 3),
+            number(row["psnr"], 2),
+            number(row["psnr_point"], 2),
+            number(row["ahead"], 2),
+        ]
+        for row in rows
+    ]
+    return Table(heads, cells, text_columns=(1,))
+
+
+def convention_table(rows: Sequence[Mapping[str, Any]], own: str | None) -> Table:
+    """Table of one method's renders under each convention, one line per convention, never averaged."""
     names = [key for key in rows[0] if key not in ("metric", "spread")]
     kept = [row for row in rows if any(row[name] is not None for name in names)]
-    heads = ["convention", *(heading(row["metric"]) for row in kept)]
-    cells = []
-    for name in names:
-        label = f"<b>{text(name)}</b>" if name == own else text(name)
-        cells.append([label, *(number(row[name], _digits(row["metric"])) for row in kept)])
-    spread = ["<i>largest less smallest</i>", *(number(row["spread"], _digits(row["metric"])) for row in kept)]
-    return table(heads, [*cells, spread])
+    cells: list[list[str | Cell]] = [
+        [
+            Cell(str(name), style="strong" if name == own else ""),
+            *(number(row[name], _digits(row["metric"])) for row in kept),
+        ]
+        for name in names
+    ]
+    if len(names) > 1:
+        spread = [number(row["spread"], _digits(row["metric"])) for row in kept]
+        cells.append([Cell("largest less smallest", style="weak"), *spread])
+    return Table(["convention", *(heading(row["metric"]) for row in kept)], cells)
 
 
-def image_table(rows: Sequence[Mapping[str, Any]], order: Sequence[str], keys: Sequence[str]) -> str:
-    """Every view of every method, in the given order of views."""
+def image_table(rows: Sequence[Mapping[str, Any]], order: Sequence[str], keys: Sequence[str]) -> Table:
+    """Table of every view of every method, in the given order of views."""
     columns = [key for key in keys if any(_has(each, key) for row in rows for each in row["per_image"])]
     cells = []
     found = [{each["name"]: each for each in row["per_image"]} for row in rows]
@@ -179,13 +185,13 @@ def image_table(rows: Sequence[Mapping[str, Any]], order: Sequence[str], keys: S
             each = views[name]
             cells.append(
                 [
-                    text(name),
-                    text(row["method"]),
+                    str(name),
+                    str(row["method"]),
                     str(each["pixels"]),
                     *(number(each.get(key), _digits(key), infinite=key in each.get("infinite", ())) for key in columns),
                 ]
             )
-    return table(["view", "method", "pixels", *map(heading, columns)], cells, kind="tall")
+    return Table(["view", "method", "pixels", *map(heading, columns)], cells, text_columns=(1,), tall=True)
 
 
 def _has(row: Mapping[str, Any], key: str) -> bool:
@@ -194,14 +200,14 @@ def _has(row: Mapping[str, Any], key: str) -> bool:
     return usable or key in row.get("infinite", ())
 
 
-def _score(row: Mapping[str, Any], key: str) -> str:
+def _score(row: Mapping[str, Any], key: str) -> Cell:
     digits = _digits(key)
     value = row.get(key) if isinstance(row.get(key), (int, float)) else None
     shown = number(value, digits, infinite=key in row.get("infinite", ()))
     low, high = (row.get("intervals") or {}).get(key) or (None, None)
     if value is None or low is None or high is None:
-        return shown
-    return f"{shown}<small>{number(low, digits)} – {number(high, digits)}</small>"
+        return Cell(shown)
+    return Cell(shown, below=f"{number(low, digits)} – {number(high, digits)}")
 
 
 def _digits(key: str) -> int:

@@ -17,7 +17,7 @@ from unghost.export.onnx.quantization import calibration_inputs, convert_onnx
 
 ROOT = Path(__file__).resolve().parents[2]
 NEEDED = ("numpy", "onnxruntime")
-ABSENT = ("torch", "onnx", "safetensors", "scipy", "tyro", "tqdm", "pip")
+ABSENT = ("torch", "onnx", "safetensors", "scipy", "tyro", "tqdm", "jinja2", "markupsafe", "pip")
 
 pytestmark = pytest.mark.slow
 

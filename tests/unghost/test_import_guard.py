@@ -19,6 +19,8 @@ ABSENT = (
     "PIL",
     "pycolmap",
     "av",
+    "jinja2",
+    "markupsafe",
 )
 BLOCKER = f"""
 import sys
@@ -48,7 +50,7 @@ def test_the_base_install_imports_and_has_a_cleaner():
         """
         import importlib, pkgutil
         import unghost, unghost.core
-        for module in pkgutil.iter_modules(unghost.core.__path__, "unghost.core."):
+        for module in pkgutil.walk_packages(unghost.core.__path__, "unghost.core."):
             importlib.import_module(module.name)
         import unghost.export.runtime
         import unghost.cli, unghost.cli.prior, unghost.fields.adapters.grids
@@ -95,7 +97,24 @@ def test_the_regularizer_names_its_extra():
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize("package", ["torch", "scipy.ndimage", "onnx", "unghost.prior.networks.restoration"])
+def test_pages_name_their_extras():
+    done = run(
+        """
+        import unghost.core.pages
+        try:
+            unghost.core.pages.render("demo.html.jinja")
+        except ImportError as error:
+            assert "pip install unghost[demo], unghost[recipes] or unghost[eval]" in str(error), error
+        else:
+            raise SystemExit("no error")
+        """
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    "package", ["torch", "jinja2", "markupsafe", "scipy.ndimage", "onnx", "unghost.prior.networks.restoration"]
+)
 def test_the_guard_can_fail(package):
     done = run(f"import {package}")
     assert done.returncode != 0

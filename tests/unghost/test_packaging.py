@@ -86,12 +86,13 @@ def test_the_wheel_holds_every_module(source, tmp_path):
     expected = {
         ("" if folder == "unghost" else "unghost/") + path.relative_to(ROOT).as_posix()
         for folder in FOLDERS
-        for pattern in ("*.py", "*.toml")
+        for pattern in ("*.py", "*.toml", "*.jinja", "*.css", "*.js")
         for path in (ROOT / folder).rglob(pattern)
         if not any(parent.is_symlink() for parent in path.parents)
     }
     assert len(expected) > 200
     assert expected <= names, expected - names
+    assert {f"unghost/core/pages/templates/{name}" for name in ("base.html.jinja", "style.css", "slider.js")} <= names
     assert "unghost/py.typed" in names
     assert {f"unghost/weights/{path.name}" for path in (ROOT / "unghost" / "weights").glob("*")} <= names
     tops = {name.split("/")[0] for name in names}

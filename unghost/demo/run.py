@@ -1,6 +1,6 @@
 """``unghost demo``: clean a room whose ghosts are known, and show and score what happened.
 
-numpy, scipy, matplotlib and onnxruntime only; no torch, no data, no network.
+numpy, scipy, matplotlib, Jinja2 and onnxruntime only; no torch, no data, no network.
 """
 
 from __future__ import annotations

@@ -1,47 +1,17 @@
 import pathlib
 import re
-import xml.dom.minidom
-from collections import Counter
-from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from unghost_tests.pages import HOSTILE, read_page
 
 from unghost import cli
 from unghost.core.shards.packing import pack_labels, quantize_signed
 from unghost.core.shards.storage import Shard, read_shard, write_shard
 from unghost.data_recipes.curation import curate
 from unghost.data_recipes.inspection.drawing import MISSING, SURFACE
-from unghost.data_recipes.inspection.page import histogram
 from unghost.data_recipes.inspection.preview import draw_pair, sources_of, write_preview
 from unghost.data_recipes.recipe import Recipe
-
-VOID = {"meta", "img", "br", "link", "input", "rect", "path"}
-
-
-class Page(HTMLParser):
-    """Collects tags, addresses and text, and checks that what opens closes."""
-
-    def __init__(self, text):
-        super().__init__()
-        self.tags, self.addresses, self.open, self.said = Counter(), [], [], []
-        self.feed(text)
-        assert self.open == []
-
-    def handle_starttag(self, tag, attrs):
-        self.tags[tag] += 1
-        self.addresses += [value for key, value in attrs if key in ("src", "href", "action", "data", "srcset")]
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag, attrs):
-        self.tags[tag] += 1
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-    def handle_data(self, data):
-        self.said.append(data)
 
 
 @pytest.fixture(scope="module")
@@ -78,16 +48,17 @@ def slabs(count):
 def test_the_page_holds_everything_and_asks_no_network(pairs, tmp_path):
     path, facts = write_preview(pairs, out=tmp_path / "deep" / "page.html", cubes=4)
     text = path.read_text(encoding="utf-8")
-    page = Page(text)
+    page = read_page(text)
     assert path == tmp_path / "deep" / "page.html"
     assert not list(path.parent.glob("*.partial"))
-    assert page.tags["img"] == 2 * 4
-    assert page.tags["script"] == page.tags["link"] == 0
-    assert all(address.startswith("data:image/png;base64,") for address in page.addresses)
+    assert page.count("img") == 2 * 4
+    assert page.count("script") == 0
+    assert [attributes["href"] for tag, attributes in page.tags if tag == "link"] == ["data:,"]  # no icon is fetched
+    assert all(attributes["src"].startswith("data:image/png;base64,") for tag, attributes in page.tags if tag == "img")
     assert not re.search(r"https?:|//[a-z]|@import|url\(", re.sub(r"base64,[\w+/=]+", "", text))
     assert facts["total"] == facts["cubes"] == 9
     assert facts["shards"] == 1
-    said = " ".join(page.said)
+    said = page.words
     for words in (
         "9 pairs of cubes",
         "empty inputs",
@@ -100,7 +71,7 @@ def test_the_page_holds_everything_and_asks_no_network(pairs, tmp_path):
         "ghost share",
     ):
         assert words in said, words
-    assert page.tags["svg"] == 6
+    assert page.count("svg") == 6
 
 
 def test_the_same_folder_gives_the_same_page(pairs, tmp_path):
@@ -129,10 +100,26 @@ def test_what_a_shard_says_of_itself_is_only_text(tmp_path):
     evil = "<script>alert(1)</script>"
     folder = tmp_path / "a<b>&c"
     shard_of(folder, signed, labels, {"recipe": evil, "licence": f'"{evil}'})
-    page = Page(write_preview(folder, cubes=1)[0].read_text(encoding="utf-8"))
-    assert page.tags["script"] == 0
-    assert "".join(page.said).count(evil) == 2
-    assert "a<b>&c" in "".join(page.said)
+    page = read_page(write_preview(folder, cubes=1)[0].read_text(encoding="utf-8"))
+    assert page.count("script") == 0
+    assert "".join(page.text).count(evil) == 2
+    assert "a<b>&c" in "".join(page.text)
+
+
+def test_names_of_recipes_meshes_and_folders_are_only_text(tmp_path):
+    signed, labels = slabs(1)
+    mesh = {"path": HOSTILE, "reason": HOSTILE}
+    provenance = {"recipe": {"name": HOSTILE, "licence": HOSTILE}, "licence": HOSTILE, "rejected": [mesh]}
+    name = HOSTILE.replace("/", "")  # no folder's name holds one
+    shard_of(tmp_path / "set" / name, signed, labels, provenance)
+    shard_of(tmp_path / name, signed, labels, {})
+    path, _ = write_preview(tmp_path / "set", cubes=1, against=tmp_path / name, out=tmp_path / "p.html")
+    page = read_page(path.read_text(encoding="utf-8"))
+    assert page.count("script") == 0
+    assert page.count("img") == 2
+    assert page.text.count(HOSTILE) == 4  # source, licence, mesh, reason
+    assert f"Compared with {name}" in page.text
+    assert any(text.startswith(f"{name}, row 0") for text in page.text)
 
 
 def test_meshes_that_were_passed_over_are_named(tmp_path):
@@ -140,8 +127,8 @@ def test_meshes_that_were_passed_over_are_named(tmp_path):
     notes = [{"path": f"kit/{row:02}.glb", "reason": "rejected: <no GLB>", "row": row} for row in range(23)]
     for name in ("a", "b"):
         shard_of(tmp_path / "s" / name, signed, labels, {"rejected": notes})
-    page = Page(write_preview(tmp_path / "s", cubes=0)[0].read_text(encoding="utf-8"))
-    said = "".join(page.said)
+    page = read_page(write_preview(tmp_path / "s", cubes=0)[0].read_text(encoding="utf-8"))
+    said = "".join(page.text)
     assert said.count("rejected: <no GLB>") == 20
     assert "kit/19.glb" in said
     assert "kit/20.glb" not in said
@@ -214,18 +201,6 @@ def test_pictures_of_a_pair_show_what_is_missing():
     assert near(whole[1], SURFACE) > 150
     assert near(whole[1], MISSING) == 0
     assert near(lacking[1], MISSING) > 150
-
-
-def test_histogram_is_valid_svg_and_its_bars_are_the_shares():
-    svg = histogram({"a": np.array([1.0, 3.0]), "b": np.array([0.0, 0.0])}, np.arange(3.0), {0: "<0>", 2: "2"})
-    parsed = xml.dom.minidom.parseString(svg)
-    heights = [
-        float(bar.getAttribute("height"))
-        for bar in parsed.getElementsByTagName("rect")
-        if bar.getAttribute("height") != "10"
-    ]
-    assert heights == pytest.approx([100 / 3, 100], abs=0.1)
-    assert "75" in svg
 
 
 def test_bad_input_is_named(tmp_path):

@@ -10,7 +10,7 @@ from unghost import cli
 
 pytestmark = pytest.mark.browser
 VIEWS, HEIGHT, WIDTH = 5, 120, 160
-CLIP = "getComputedStyle(document.querySelector('.wipe .top')).clipPath"
+CLIP = "getComputedStyle(document.querySelector('.slider .top')).clipPath"
 HOSTILE = "<script>document.title='x'</script>&\"'"
 
 
@@ -57,12 +57,14 @@ def test_everything_arrives_and_nothing_is_fetched(browser, report):
 def test_the_slider_follows_the_pointer_and_the_arrow_keys(browser, report):
     browser.open(report)
     assert browser.look(CLIP) == "inset(0px 50% 0px 0px)"
-    browser.drag(".wipe input", to=0.8)
+    browser.drag(".slider input", to=0.8)
     shown = float(browser.look(CLIP).split()[1].rstrip("%"))
     assert shown == pytest.approx(20, abs=2.5)
     browser.press("ArrowLeft", 37)
     assert float(browser.look(CLIP).split()[1].rstrip("%")) == pytest.approx(shown + 1)
-    others = browser.look("[...document.querySelectorAll('.wipe')].slice(1).map(w => w.style.getPropertyValue('--at'))")
+    others = browser.look(
+        "[...document.querySelectorAll('.slider')].slice(1).map(s => s.style.getPropertyValue('--at'))"
+    )
     assert others == ["", ""]  # one view's slider moves that view alone
 
 

@@ -1,48 +1,15 @@
 import json
 import re
-from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from unghost_tests.pages import HOSTILE, read_page
 
-from unghost.evaluation.report import charts as page_charts
 from unghost.evaluation.report import page
 from unghost.evaluation.report import pictures as page_pictures
 from unghost.evaluation.report import tables as page_tables
-from unghost.evaluation.report.charts import Series, line_chart
 from unghost.evaluation.report.pictures import ViewPictures, error_picture, worst_first
 from unghost.evaluation.report.tables import number, score_table
-
-HOSTILE = '<img src=x onerror="alert(1)">&\'</script><script>alert(2)</script>'
-
-
-class Reader(HTMLParser):
-    """Tags, attributes and whether they nest."""
-
-    def __init__(self):
-        super().__init__(convert_charrefs=True)
-        self.tags, self.open, self.text = [], [], []
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append((tag, dict(attrs)))
-        if tag not in ("meta", "link", "img", "input", "line", "polyline"):
-            self.open.append(tag)
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag, (tag, self.open)
-
-    def handle_startendtag(self, tag, attrs):
-        self.tags.append((tag, dict(attrs)))
-
-    def handle_data(self, data):
-        self.text.append(data)
-
-
-def read(text):
-    reader = Reader()
-    reader.feed(text)
-    assert reader.open == []
-    return reader
 
 
 def rows():
@@ -72,15 +39,9 @@ def rows():
 
 
 def test_the_page_is_one_file_that_nests_and_fetches_nothing():
-    reader = read(page.page_text({"rows": rows(), "command": "c", "commit": "d"}))
-    for tag, attributes in reader.tags:
-        for key in ("src", "href"):
-            assert attributes.get(key, "data:").startswith("data:"), (tag, attributes)
-    assert "url(" not in page.STYLE
-    assert "@import" not in page.STYLE
-    words = " ".join(reader.text)
-    assert "a pixel counts in 1 of 2 views only" in words
-    assert sum(tag == "svg" for tag, _ in reader.tags) == 2
+    reader = read_page(page.page_text({"rows": rows(), "command": "c", "commit": "d"}))
+    assert "a pixel counts in 1 of 2 views only" in reader.words
+    assert reader.count("svg") == 2
 
 
 def test_hostile_names_are_text_everywhere():
@@ -104,6 +65,7 @@ def test_hostile_names_are_text_everywhere():
         "high": 2.0,
         "images": 2,
     }
+    ahead = {"method": HOSTILE, "point": HOSTILE, "coverage": 0.5, "psnr": 1.0, "psnr_point": 2.0, "ahead": 1.0}
     results = {
         "rows": found,
         "command": HOSTILE,
@@ -111,14 +73,18 @@ def test_hostile_names_are_text_everywhere():
         "versions": {HOSTILE: HOSTILE},
         "machine": {"cores": HOSTILE, "architecture": HOSTILE},
         "differences": [difference],
+        "against_points": [ahead],
         "conventions": {HOSTILE: [{"metric": HOSTILE, HOSTILE: 1.0, "spread": None}]},
         "evaluation": {"views": 2, "width": 4, "height": 4, "gt": HOSTILE, "masks": HOSTILE, "notes": [HOSTILE]},
     }
-    reader = read(page.page_text(results, [view]))
-    assert [tag for tag, _ in reader.tags].count("script") == 1  # the page's own
-    assert not [attributes for _, attributes in reader.tags if "onerror" in attributes]
+    reader = read_page(page.page_text(results, [view]))
+    assert reader.count("script") == 1  # the page's own
     assert all(attributes["src"].startswith("data:image/jpeg") for tag, attributes in reader.tags if tag == "img")
     assert sum(HOSTILE in each for each in reader.text) > 10
+
+
+def texts(row):
+    return [cell if isinstance(cell, str) else cell.text for cell in row]
 
 
 def test_lpips_on_two_backbones_is_two_columns_that_name_them():
@@ -126,10 +92,17 @@ def test_lpips_on_two_backbones_is_two_columns_that_name_them():
         {"method": name, "convention": "proper", "lpips": value, "lpips_backbone": name}
         for name, value in (("vgg", 0.5), ("alex", 0.25))
     ]
-    text = score_table(found, ["lpips"])
-    assert re.findall(r"LPIPS \((\w+)\)", text) == ["vgg", "alex"]
-    assert re.findall(r"<td>(.*?)</td>", text) == ["0.500", "–", "–", "0.250"]
-    assert "LPIPS (" not in score_table([{"method": "a", "lpips": 0.5}], ["lpips"])
+    table = score_table(found, ["lpips"])
+    assert re.findall(r"LPIPS \((\w+)\)", " ".join(table.heads)) == ["vgg", "alex"]
+    assert [texts(row) for row in table.rows] == [["vgg", "0.500", "–"], ["alex", "–", "0.250"]]
+    assert score_table([{"method": "a", "lpips": 0.5}], ["lpips"]).heads == ["method", "LPIPS\N{NO-BREAK SPACE}↓"]
+
+
+def test_the_interval_is_below_its_mean_and_the_colour_before_the_name():
+    table = score_table(rows(), ["psnr"], {"a": 0, "b": 1})
+    (name, score), (other, plain) = table.rows
+    assert (name.text, name.series, other.series) == ("a", 0, 1)
+    assert (score.text, score.below, plain.below) == ("20.00", "19.00 – 21.00", "")
 
 
 def test_two_conventions_are_two_tables_and_one_table_refuses_both():
@@ -164,7 +137,7 @@ def test_results_of_other_programs_make_a_page_too():
         for convention in ("proper", "paper_code")
     ]
     mean = {"method": "ours", "scene": "mean", "convention": "proper", "psnr": 17.5, "coverage": 0.8, "per_seed": [{}]}
-    reader = read(page.page_text({"rows": [*made, mean]}))
+    reader = read_page(page.page_text({"rows": [*made, mean]}))
     tags = [tag for tag, _ in reader.tags]
     assert tags.count("svg") == 2 * 2 + 1  # a convention and a scene each, and the mean's single point
     assert tags.count("polyline") == 2 * 2 * 2 * 2
@@ -180,23 +153,25 @@ def test_numbers_and_what_stands_for_none():
     assert number("text", 2) == "–"
     assert page_tables._signed(0.004, 2) == "0.00"
     assert page_tables._signed(0.4, 2) == "+0.40"
-    assert "∞" in score_table([{"method": "a", "psnr": None, "infinite": ["psnr"]}], ["psnr"])
-    assert score_table([{"method": "a", "psnr": None}], ["psnr"]) == ""
-    assert "True" not in score_table([{"method": "a", "psnr": True, "ssim": 1.0}], ["psnr", "ssim"])
+    endless = score_table([{"method": "a", "psnr": None, "infinite": ["psnr"]}], ["psnr"])
+    assert texts(endless.rows[0]) == ["a", "∞"]
+    assert score_table([{"method": "a", "psnr": None}], ["psnr"]) is None
+    assert texts(score_table([{"method": "a", "psnr": True, "ssim": 1.0}], ["psnr", "ssim"]).rows[0]) == ["a", "1.000"]
 
 
 def test_a_difference_is_called_so_only_if_its_interval_leaves_out_zero():
     row = {"method": "a", "against": "b", "convention": "c", "images": 3}
     cases = [
-        ("psnr", 1.0, 0.5, 1.5, "better"),
-        ("flip", 1.0, 0.5, 1.5, "worse"),
-        ("psnr", 1.0, -0.5, 2.5, "no difference"),
-        ("coverage", -0.1, -0.2, -0.05, "differs"),
-        ("psnr", 1.0, None, None, "one image"),
+        ("psnr", 1.0, 0.5, 1.5, "better", "better"),
+        ("flip", 1.0, 0.5, 1.5, "worse", "worse"),
+        ("psnr", 1.0, -0.5, 2.5, "no difference shown", "weak"),
+        ("coverage", -0.1, -0.2, -0.05, "differs", ""),
+        ("psnr", 1.0, None, None, "one image", "weak"),
     ]
-    for metric, mean, low, high, verdict in cases:
-        text = page_tables.difference_table([{**row, "metric": metric, "difference": mean, "low": low, "high": high}])
-        assert f">{verdict}" in text, (metric, verdict)
+    for metric, mean, low, high, verdict, style in cases:
+        table = page_tables.difference_table([{**row, "metric": metric, "difference": mean, "low": low, "high": high}])
+        cell = table.rows[0][table.heads.index("verdict")]
+        assert (cell.text, cell.style) == (verdict, style), metric
 
 
 def test_the_worst_come_first_and_the_undefined_last():
@@ -222,26 +197,6 @@ def test_errors_are_painted_by_size_and_grey_where_nothing_counts():
     np.testing.assert_allclose(painted[0, 2], page_pictures.HEAT[-1])
     np.testing.assert_allclose(painted[0, 3], page_pictures.NOT_COUNTED)
     assert preds[0, 3].max() == 0
-
-
-def test_charts_place_points_where_they_belong():
-    drawn = line_chart([Series("a", (0.0, 1.0), (10.0, 20.0))], x_label="x", y_label="y")
-    points = re.search(r'points="([^"]+)"', drawn).group(1).split()
-    (x0, y0), (x1, y1) = ([float(each) for each in point.split(",")] for point in points)
-    span = page_charts.WIDTH - page_charts.LEFT - page_charts.RIGHT
-    assert x1 - x0 == pytest.approx(span / 1.12, abs=0.1)  # six hundredths of margin on either side
-    assert y0 > y1
-    assert line_chart([Series("a", (), ())], x_label="x", y_label="y") == ""
-    single = line_chart([Series("a", (0.5,), (7.0,))], x_label="x", y_label="y")
-    assert single.count("<circle") == 1
-    assert "polyline" not in single
-
-
-@pytest.mark.parametrize(("low", "high"), [(0, 1), (15, 36), (0.9, 0.91), (-3, 1e4), (1e-9, 2e-9)])
-def test_ticks_are_few_and_inside(low, high):
-    ticks = page_charts._ticks(low, high)
-    assert 2 <= len(ticks) <= page_charts.TICKS + 1
-    assert all(low - 1e-12 <= each <= high + 1e-12 for each in ticks)
 
 
 def test_results_files_are_read_with_care(tmp_path):
