@@ -44,10 +44,10 @@ SERVES = {  # extra -> the folders whose code it is for; a new extra needs a row
         "export",
         "unghost",
     },
-    "recipes": {"data_recipes", "scenes"},
+    "recipes": {"core", "data_recipes", "scenes"},
     "export": {"export", "prior"},
-    "eval": {"evaluation", "baselines", "unghost"},
-    "demo": {"unghost", "scenes"},
+    "eval": {"core", "evaluation", "baselines", "unghost"},
+    "demo": {"core", "unghost", "scenes"},
     "capture": {"evaluation", "unghost"},
     "scale": {"data_recipes"},
 }
