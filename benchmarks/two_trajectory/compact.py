@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from unghost.core.metrics import METRICS
+from unghost.evaluation.report.tables import EQUAL_KEYS, OWN_KEYS
 
 from ..compact import rounded, write_lines
 from .tables import AT_EQUAL, FROM, Cell, lowest_coverage, run_of
@@ -28,6 +29,8 @@ SCALES = dict(zip(AT_EQUAL, (1000, 10_000, 10_000, 100)))  # score of a curve ->
 EXACT = ("factor", "knob")  # compared, not averaged
 NESTED = ("curves", "ause")  # a value for each order of pixels; ``own`` is left out where it is ``spread``
 UNPRINTED = "normal_mean_deg_area"
+
+PRINTED = frozenset((*OWN_KEYS, *EQUAL_KEYS))  # metrics whose intervals reports print
 
 
 def write_compact(path: Path, results: Mapping[str, Any]) -> None:
@@ -70,7 +73,7 @@ def compact_rows(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         intervals = {
             key: [round(end, METRICS[key].decimals) for end in ends]
             for key, ends in known.pop("intervals", {}).items()
-            if key in METRICS and None not in ends
+            if key in PRINTED and None not in ends
         }
         result.append({**rounded(known, ROW_DIGITS), "intervals": intervals})
     return result
