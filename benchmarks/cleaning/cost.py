@@ -29,7 +29,7 @@ from unghost.denoisers import shipped_names
 from unghost.fields.adapters.grids import cell_centers, grid_density_fn
 from unghost.scenes.labelled_room.room import AABB, SHAPE, Room, build_room
 
-from ..fit_cache import say
+from ..progress import say
 from ..timing import median_seconds
 
 ROOT = Path(__file__).resolve().parents[2]

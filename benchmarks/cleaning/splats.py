@@ -28,7 +28,7 @@ from unghost.facade import clean_splats
 from unghost.scenes.generator import random_scene
 from unghost.splats.ply import Gaussians
 
-from ..fit_cache import say
+from ..progress import say
 
 ROOT = Path(__file__).resolve().parents[2]
 KINDS = ("surface", "blob", "haze", "needle")

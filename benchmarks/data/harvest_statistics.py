@@ -44,7 +44,7 @@ from unghost.data_recipes.pairs import make_chunk
 from unghost.data_recipes.recipe import Recipe, load_recipe
 
 from ..denoise.capture_cubes import capture_shards, cubes_folder
-from ..fit_cache import say
+from ..progress import say
 
 ROOT = Path(__file__).resolve().parents[2]
 SEED = 91

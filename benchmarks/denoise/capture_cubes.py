@@ -33,7 +33,8 @@ from unghost.data_recipes.harvest.run import harvest_cubes
 from unghost.evaluation.captures.loading import load_capture
 from unghost.evaluation.scoring.protocol import optical_depth
 
-from ..fit_cache import FitCache, code_hash, file_hash, say
+from ..fit_cache import FitCache, code_hash, file_hash
+from ..progress import say
 from ..two_trajectory.real_capture import Options as CaptureOptions
 from ..two_trajectory.real_capture import Sweep, fit_field, render
 

@@ -30,7 +30,7 @@ from unghost.prior.networks.restoration import SIZES
 from unghost.prior.training.config import TrainConfig
 from unghost.prior.training.loop import train
 
-from ..fit_cache import say
+from ..progress import say
 from .run import Options as Measurement
 from .run import all_sets, mean_over_severities, row_of
 from .sets import MIXED, CubeSet, blind

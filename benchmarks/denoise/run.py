@@ -30,7 +30,8 @@ from unghost.core.channels import encode_known, stack_channels
 from unghost.core.results import build_results, write_results
 from unghost.core.shards.packing import dequantize_share, dequantize_signed
 
-from ..fit_cache import file_hash, say
+from ..fit_cache import file_hash
+from ..progress import say
 from .figure import draw
 from .scores import score
 from .sets import MIXED, SEED, SEVERITIES, CubeSet, blind, capture_set, harvest_set, mesh_sets, tells_more

@@ -12,7 +12,7 @@ from unghost.core.manifest import Manifest
 from unghost.export.container import precision_of
 from unghost.speed import measure_speed
 
-from ..fit_cache import say
+from ..progress import say
 
 BATCH, SECONDS = 40, 8.0
 UNTRAINED = ("unet-epsilon", "l")  # as `train_diffusion.py` and `unghost train --size` name them

@@ -38,7 +38,7 @@ from unghost.regularizer.view_grid import ViewGrid
 from unghost.regularizer.visibility import ViewCounter
 from unghost.scenes.labelled_room.room import AABB, build_room
 
-from ..fit_cache import say
+from ..progress import say
 from ..timing import median_seconds
 from .filling import fill_row
 from .grid_field import GridField

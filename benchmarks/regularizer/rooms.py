@@ -39,7 +39,8 @@ from unghost.fields.training import TrainingConfig, train_field
 from unghost.regularizer.density_regularizer import DensityRegularizer
 from unghost.scenes.generator import observers, photograph, random_scene
 
-from ..fit_cache import say, training_hooks
+from ..fit_cache import training_hooks
+from ..progress import say
 
 ROOT = Path(__file__).resolve().parents[2]
 RULE = OccupancyRule()

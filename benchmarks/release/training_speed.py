@@ -32,7 +32,7 @@ from unghost.prior.training.batches import Mixture
 from unghost.prior.training.config import TrainConfig
 from unghost.prior.training.run_state import Trainer
 
-from ..fit_cache import say
+from ..progress import say
 
 ROOT = Path(__file__).resolve().parents[2]
 WARM_UP = 3

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -19,6 +18,7 @@ from unghost.fields.training import TrainingConfig, train_field
 from unghost.regularizer.density_regularizer import DensityRegularizer
 from unghost.regularizer.settings import RegularizerSettings
 
+from ..timing import Clock
 from .scenes import TrajectoryScene
 
 REACH = 3.0  # how many times the box the visibility loss goes out to
@@ -99,18 +99,6 @@ class Job:
     def fitting(self) -> TrainingConfig:
         """As the field was fitted."""
         return TrainingConfig(rays=self.scene.rays, sampling=self.scene.sampling)
-
-
-class Clock:
-    """Seconds since it was made, as the fields of :class:`Outcome` are called."""
-
-    def __init__(self) -> None:
-        self._begun = time.perf_counter(), time.process_time()
-
-    def read(self) -> dict[str, float]:
-        """By the clock, and of all threads together."""
-        now = time.perf_counter(), time.process_time()
-        return {"seconds": now[0] - self._begun[0], "cpu_seconds": now[1] - self._begun[1]}
 
 
 def render(outcome: Outcome, scene: TrajectoryScene, cameras: Cameras, *, values: bool = True) -> Views:

@@ -20,7 +20,8 @@ import tyro
 from unghost.evaluation.report.rows import draw_comparison
 from unghost.evaluation.uncertainty.photometric import photo_doubt
 
-from ..fit_cache import FitCache, say
+from ..fit_cache import FitCache
+from ..progress import say
 from .job import Job, Outcome, Views, render
 from .methods import METHODS, judged
 from .run import Options as Benchmark

@@ -37,7 +37,8 @@ from unghost.fields.training import train_field
 from unghost.regularizer.density_regularizer import DensityRegularizer
 from unghost.regularizer.settings import RegularizerSettings
 
-from ..fit_cache import FitCache, Plan, code_hash, file_hash, say, training_hooks
+from ..fit_cache import FitCache, code_hash, file_hash, training_hooks
+from ..progress import Plan, say
 from .scenes import Sweep
 
 ROOT = Path(__file__).resolve().parents[2]

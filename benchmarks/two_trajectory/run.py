@@ -40,7 +40,8 @@ from unghost.fields.radiance import RadianceConfig, RadianceField
 from unghost.fields.rendering import render_view
 from unghost.fields.training import TrainingConfig, train_field
 
-from ..fit_cache import FitCache, Plan, say
+from ..fit_cache import FitCache
+from ..progress import Plan, say
 from .ablation import ABLATION
 from .figure import write_figures
 from .job import Job, Outcome, Weights

@@ -23,7 +23,8 @@ from unghost.evaluation.scoring.views import Renders, Truth
 from unghost.evaluation.uncertainty.photometric import photo_doubt
 from unghost.evaluation.uncertainty.sparsification import sparsify
 
-from .job import Clock, Outcome, Views, render
+from ..timing import Clock
+from .job import Outcome, Views, render
 from .scenes import LabelledSpace, TrajectoryScene
 
 CONVENTION = "proper"

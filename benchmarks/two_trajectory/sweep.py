@@ -25,7 +25,8 @@ import tyro
 from unghost.core.results import build_results, write_results
 from unghost.evaluation.scoring.protocol import json_ready
 
-from ..fit_cache import FitCache, say
+from ..fit_cache import FitCache
+from ..progress import say
 from .job import Job, Weights
 from .methods import FACTOR_OF, METHODS
 from .run import Options as Benchmark
