@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, NoReturn, TypeVar
 
 import tyro
 
@@ -113,7 +113,7 @@ def parse(kind: type[Kind], description: str | None, args: Sequence[str] | None 
     return options
 
 
-def give_up(kind: type[BenchmarkOptions], reason: str) -> None:
+def give_up(kind: type, reason: str) -> NoReturn:
     """Print one line that says what is missing; exit with status 2.
 
     Raises:

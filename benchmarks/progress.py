@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +46,11 @@ class Plan:
         say(
             f"[{self.total - len(self.left)}/{self.total}] {what} · {so_far:.1f} min so far, about {rest / 60:.1f} left"
         )
+
+    def skip(self, stages: Iterable[str]) -> None:
+        """Take stages that will not come out of the plan."""
+        for stage in stages:
+            self.left.remove(stage)
 
     def _learn(self) -> None:
         spent = time.perf_counter() - self.now

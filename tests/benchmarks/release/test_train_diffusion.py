@@ -43,7 +43,7 @@ def test_compact_runs_differ_in_the_objective_alone(bench):
     assert bench.PUBLISHED["unet-epsilon"].network == UNetConfig()
 
 
-def test_a_budget_is_needed(bench, tmp_path, capsys):
+def test_a_budget_is_needed(bench, shard_paths, tmp_path, capsys):
     with pytest.raises(SystemExit):
-        bench.main(["shards", "--out", str(tmp_path)])
+        bench.main([str(shard_paths["a"]), "--out", str(tmp_path)])
     assert "give --minutes or --steps" in capsys.readouterr().err
