@@ -50,13 +50,15 @@ class Options(BenchmarkOptions):
     Attributes:
         seeds: of the rooms.
         repeats: of the empty-space rows, of which the median is taken.
+        settings: rows of settings changed from the defaults.
         cameras: how many, of each memory row.
     """
 
-    SHORT: ClassVar[dict[str, Any]] = {"seeds": (30,), "repeats": 1, "cameras": (10,)}
+    SHORT: ClassVar[dict[str, Any]] = {"seeds": (30,), "repeats": 1, "settings": tuple(SETTINGS)[:5], "cameras": (10,)}
 
     seeds: tuple[int, ...] = (30, 31, 32)
     repeats: int = 3
+    settings: tuple[str, ...] = tuple(SETTINGS)
     cameras: tuple[int, ...] = (10, 100, 1000)
 
 
@@ -174,7 +176,8 @@ def main() -> None:
     rows = [setting_row(f"clean, {name}", name, rooms, options.threads) for name in shipped_names()]
     rows.append(setting_row("clean, views, 40 cameras", "views", rooms, options.threads, cameras=ring(40)))
     rows += [
-        setting_row(f"clean, {method}", "default", rooms, options.threads, **SETTINGS[method]) for method in SETTINGS
+        setting_row(f"clean, {method}", "default", rooms, options.threads, **SETTINGS[method])
+        for method in options.settings
     ]
     rows += [*empty_rows(rooms[0], options), *memory_rows(options.cameras)]
     results = build_results(rows, command=options.command(), seeds=options.seeds, threads=options.threads)
