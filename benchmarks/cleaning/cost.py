@@ -175,10 +175,8 @@ def main() -> None:
     setting_row("warm-up", "default", rooms[:1], options.threads)
     rows = [setting_row(f"clean, {name}", name, rooms, options.threads) for name in shipped_names()]
     rows.append(setting_row("clean, views, 40 cameras", "views", rooms, options.threads, cameras=ring(40)))
-    rows += [
-        setting_row(f"clean, {method}", "default", rooms, options.threads, **SETTINGS[method])
-        for method in options.settings
-    ]
+    for name in options.settings:
+        rows.append(setting_row(f"clean, {name}", "default", rooms, options.threads, **SETTINGS[name]))
     rows += [*empty_rows(rooms[0], options), *memory_rows(options.cameras)]
     results = build_results(rows, command=options.command(), seeds=options.seeds, threads=options.threads)
     write_results(options.out / "cleaning.json", results)

@@ -38,7 +38,7 @@ NEAR = 1e-5  # nerfbaselines rounds its means to 5 places
 
 @dataclass(frozen=True)
 class Options(BenchmarkOptions):
-    """What to check: every protocol, or the last one alone if short."""
+    """What to check: every protocol, or the one of the convention ``proper`` if short."""
 
 
 def cameras(shifts: tuple[float, ...]) -> Cameras:
@@ -163,10 +163,10 @@ def main() -> None:
     if importlib.util.find_spec("nerfbaselines") is None:
         give_up(Options, "needs nerfbaselines in an environment of its own: make nerfbaselines")
     maps, photos, colours, depth = scene()
-    rows = []
+    rows, chosen = [], [each for each in PROTOCOLS if each.convention == "proper" or not options.short]
     with tempfile.TemporaryDirectory() as scratch:
         maps.save(Path(scratch) / "masks.npz")
-        for index, protocol in enumerate(PROTOCOLS[-1:] if options.short else PROTOCOLS):
+        for index, protocol in enumerate(chosen):
             if protocol.convention == "proper":  # from here on they need the cameras
                 os.environ[MASKS_VARIABLE] = str(Path(scratch) / "masks.npz")
             folder = Path(scratch) / str(index)
