@@ -8,6 +8,7 @@ Results go to out/short, what each prints to out/short/logs. Exit status 1 if on
 
 from __future__ import annotations
 
+import resource
 import subprocess
 import sys
 import time
@@ -52,6 +53,12 @@ class Options:
         return [name for name in WITHOUT_DATA if not self.names or name.startswith(self.names)]
 
 
+def processor_seconds() -> float:
+    """What finished child processes have taken, all threads together."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
 def main() -> int:
     options = tyro.cli(Options, description=__doc__)
     chosen, lines, failed = options.chosen(), list[str](), 0
@@ -59,14 +66,15 @@ def main() -> int:
     logs.mkdir(parents=True, exist_ok=True)
     for number, name in enumerate(chosen, 1):
         say(f"[{number}/{len(chosen)}] {name}")
-        log, begun = logs / f"{name}.txt", time.perf_counter()
+        log, begun, spent = logs / f"{name}.txt", time.perf_counter(), processor_seconds()
         with log.open("w", encoding="utf-8") as stream:
             command = [sys.executable, "-m", f"benchmarks.{name}", "--short"]
             status = subprocess.run(command, cwd=ROOT, stdout=stream, stderr=subprocess.STDOUT, check=False).returncode
-        seconds = time.perf_counter() - begun
+        seconds, spent = time.perf_counter() - begun, processor_seconds() - spent
         last = (log.read_text(encoding="utf-8").strip().splitlines() or [""])[-1]
-        lines.append(f"{name:28s} {seconds:6.0f} s  {'ok' if status == 0 else f'FAILED, status {status}'}")
-        say(f"    {seconds:.0f} s, status {status}: {last}")
+        took = f"{seconds:.0f} s, of a processor {spent:.0f} s"
+        lines.append(f"{name:28s} {took:32s} {'ok' if status == 0 else f'FAILED, status {status}'}")
+        say(f"    {took}, status {status}: {last}")
         failed += status != 0
     say("\n".join(["", *lines]))
     wrote(logs)

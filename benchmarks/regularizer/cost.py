@@ -67,7 +67,7 @@ class Options(BenchmarkOptions):
         "repeats": 1,
         "points": 8192,
         "cubes": 2,
-        "fill_steps": 3,
+        "fill_steps": 1,
         "overhead_steps": (2, 2),
     }
     DATA: ClassVar[dict[str, str]] = {"capture": CAPTURE}

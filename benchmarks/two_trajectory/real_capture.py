@@ -72,7 +72,7 @@ class Options(BenchmarkOptions):
     SHORT: ClassVar[dict[str, Any]] = {
         "seeds": (0,),
         "downscale": 32,
-        "steps": 10,
+        "steps": 5,
         "finetune_steps": 2,
         "resolution": 32,
         "settings": ("cubes=2", "visibility_samples=1024"),
