@@ -22,13 +22,14 @@ NERFBASELINES_NEEDS := 'numpy<2' opencv-python-headless click tqdm Pillow matplo
 	typing-extensions onnxruntime tyro
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check clean clean-all demo-setup nerfstudio nerfbaselines
+.PHONY: help setup demo test check bench-short clean clean-all demo-setup nerfstudio nerfbaselines
 
 help:
 	@echo "make demo       clean a synthetic room with labelled ghosts; writes out/demo/index.html (no torch)"
 	@echo "make test       set up everything, then run the whole test suite"
 	@echo "make setup      create .venv with every extra, pinned by constraints.txt"
 	@echo "make check      ruff, formatting, mypy"
+	@echo "make bench-short  the short form of every benchmark that needs no data, into out/short"
 	@echo "make nerfstudio nerfacto with the regularizer on, for some steps, in .venv-nerfstudio"
 	@echo "make nerfbaselines  its command line scores with this project's protocols, in .venv-nerfbaselines"
 	@echo "make clean      remove caches and builds"
@@ -93,6 +94,10 @@ check: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# One after the other; each writes its output to out/short/logs. benchmarks/README.md lists them.
+bench-short: setup
+	$(BIN)/python -m benchmarks.all_short $(ARGUMENTS)
 
 # nerfstudio 1.1.5 pins an old protobuf and much that its models do without: an environment of its own, no dependencies.
 $(NERFSTUDIO)/.made:

@@ -1,4 +1,4 @@
-"""What long measurements share: fitted fields and renderings kept on disk, and a plan that says how long is left."""
+"""Cache of fitted fields and renderings on disk, shared by the long measurements."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ import dataclasses
 import hashlib
 import json
 import os
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +17,9 @@ from safetensors.torch import load_file, save_file
 import unghost.fields
 from unghost.fields.radiance import RadianceConfig, RadianceField
 
+from .progress import say
+
 Views = dict[str, NDArray[Any]]
-
-
-def say(text: str) -> None:
-    """A line of progress, at once."""
-    print(text, flush=True)
 
 
 def training_hooks(regularizer: Any) -> dict[str, Any]:
@@ -101,35 +97,3 @@ class FitCache:
             np.savez(stream, **made)  # type: ignore[arg-type]
         os.replace(partial, path)
         return made
-
-
-class Plan:
-    """Says what is being done, and about how long the rest will take.
-
-    Args:
-        stages: kinds of stages, one entry for each that is to come.
-        guesses: seconds of each kind, until one has been timed.
-    """
-
-    def __init__(self, stages: Sequence[str], guesses: dict[str, float]) -> None:
-        self.left, self.total = list(stages), len(stages)
-        self.durations = {kind: [seconds] for kind, seconds in guesses.items()}
-        self.begun = self.now = time.perf_counter()
-        self.current: str | None = None
-
-    def begin(self, stage: str, what: str) -> None:
-        """Announce the next stage."""
-        self._learn()
-        rest = sum(float(np.mean(self.durations[each])) for each in self.left)
-        self.left.remove(stage)
-        self.current, self.now = stage, time.perf_counter()
-        so_far = (self.now - self.begun) / 60
-        say(
-            f"[{self.total - len(self.left)}/{self.total}] {what} · {so_far:.1f} min so far, about {rest / 60:.1f} left"
-        )
-
-    def _learn(self) -> None:
-        spent = time.perf_counter() - self.now
-        if self.current is not None and spent > 2.0:  # less: it came from the cache
-            timed = self.durations[self.current]
-            self.durations[self.current] = [spent] if len(timed) == 1 else [*timed[-2:], spent]

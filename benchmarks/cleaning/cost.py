@@ -15,10 +15,9 @@ import statistics
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
-import tyro
 
 from unghost import load_denoiser
 from unghost.cleaning.pipeline import clean
@@ -29,10 +28,10 @@ from unghost.denoisers import shipped_names
 from unghost.fields.adapters.grids import cell_centers, grid_density_fn
 from unghost.scenes.labelled_room.room import AABB, SHAPE, Room, build_room
 
-from ..fit_cache import say
+from ..options import BenchmarkOptions, parse
+from ..progress import say, wrote
 from ..timing import median_seconds
 
-ROOT = Path(__file__).resolve().parents[2]
 SETTINGS: dict[str, dict[str, Any]] = {
     "cells only": {"level_weights": (1.0,)},
     "twice the cell only": {"level_weights": (0.0, 1.0)},
@@ -42,24 +41,25 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "overlap .75": {"overlap": 0.75},
     "bits": {"soft": False},
 }
-CAMERAS = (10, 100, 1000)
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(BenchmarkOptions):
     """What to time.
 
     Attributes:
         seeds: of the rooms.
-        threads: of onnxruntime.
         repeats: of the empty-space rows, of which the median is taken.
-        out: where cleaning.json goes.
+        settings: rows of settings changed from the defaults.
+        cameras: how many, of each memory row.
     """
 
+    SHORT: ClassVar[dict[str, Any]] = {"seeds": (30,), "repeats": 1, "settings": tuple(SETTINGS)[:5], "cameras": (10,)}
+
     seeds: tuple[int, ...] = (30, 31, 32)
-    threads: int = 2
     repeats: int = 3
-    out: Path = ROOT / "docs" / "results"
+    settings: tuple[str, ...] = tuple(SETTINGS)
+    cameras: tuple[int, ...] = (10, 100, 1000)
 
 
 def setting_row(method: str, name: str, rooms: list[Room], threads: int, **settings: Any) -> dict[str, Any]:
@@ -153,12 +153,12 @@ def _peak_megabytes() -> float:
     return next(float(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM:"))
 
 
-def memory_rows() -> list[dict[str, Any]]:
+def memory_rows(cameras: tuple[int, ...]) -> list[dict[str, Any]]:
     """Each in a fresh process."""
     rows: list[dict[str, Any]] = []
     context = multiprocessing.get_context("spawn")
     for what in ("clean", "dsds and visibility step"):
-        for count in CAMERAS:
+        for count in cameras:
             ours, theirs = context.Pipe()
             process = context.Process(target=_most_memory, args=(what, count, theirs))
             process.start()
@@ -170,19 +170,17 @@ def memory_rows() -> list[dict[str, Any]]:
 
 
 def main() -> None:
-    options = tyro.cli(Options, description=__doc__)
+    options = parse(Options, __doc__)
     rooms = [build_room(seed) for seed in options.seeds]
     setting_row("warm-up", "default", rooms[:1], options.threads)
     rows = [setting_row(f"clean, {name}", name, rooms, options.threads) for name in shipped_names()]
     rows.append(setting_row("clean, views, 40 cameras", "views", rooms, options.threads, cameras=ring(40)))
-    rows += [
-        setting_row(f"clean, {method}", "default", rooms, options.threads, **SETTINGS[method]) for method in SETTINGS
-    ]
-    rows += [*empty_rows(rooms[0], options), *memory_rows()]
-    results = build_results(
-        rows, command="python -m benchmarks.cleaning.cost", seeds=options.seeds, threads=options.threads
-    )
+    for name in options.settings:
+        rows.append(setting_row(f"clean, {name}", "default", rooms, options.threads, **SETTINGS[name]))
+    rows += [*empty_rows(rooms[0], options), *memory_rows(options.cameras)]
+    results = build_results(rows, command=options.command(), seeds=options.seeds, threads=options.threads)
     write_results(options.out / "cleaning.json", results)
+    wrote(options.out / "cleaning.json")
 
 
 if __name__ == "__main__":

@@ -15,11 +15,9 @@ import dataclasses
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
-import tyro
 from numpy.typing import NDArray
 
 from unghost.cleaning.splats import box_of, pitch_of
@@ -28,29 +26,29 @@ from unghost.facade import clean_splats
 from unghost.scenes.generator import random_scene
 from unghost.splats.ply import Gaussians
 
-from ..fit_cache import say
+from ..options import BenchmarkOptions, parse
+from ..progress import Plan, say, wrote
 
-ROOT = Path(__file__).resolve().parents[2]
 KINDS = ("surface", "blob", "haze", "needle")
 REFERENCE = 40_000  # splats of a scene whose sizes are as written in `make`
 Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(BenchmarkOptions):
     """What to measure.
 
     Attributes:
         splats: Gaussians of a scene, floaters included.
         floaters: share of them that are floaters.
         seeds: of the scenes.
-        out: where splats.json goes.
     """
+
+    SHORT: ClassVar[dict[str, Any]] = {"splats": 5000, "seeds": (900,)}
 
     splats: int = 500_000
     floaters: float = 0.08
     seeds: tuple[int, ...] = (900, 901, 902)
-    out: Path = ROOT / "docs" / "results"
 
 
 @dataclass(frozen=True)
@@ -223,19 +221,19 @@ def row_of(name: str, seed: int, scene: Scene) -> dict[str, Any]:
 
 
 def main() -> None:
-    options = tyro.cli(Options, description=__doc__)
+    options = parse(Options, __doc__)
     rows = []
     small = make(0, dataclasses.replace(options, splats=3000))
     for method in METHODS.values():  # imports, and loading the prior, are not timed
         method(small.gaussians)
+    plan = Plan(["scene"] * len(options.seeds), {"scene": options.splats / 2500})
     for seed in options.seeds:
+        plan.begin("scene", f"scene {seed}, {options.splats} splats")
         scene = make(seed, options)
         rows += [row_of(name, seed, scene) for name in METHODS]
-    seeds = " ".join(map(str, options.seeds))
-    scenes = f"--splats {options.splats} --floaters {options.floaters:g}"
-    command = f"python -m benchmarks.cleaning.splats {scenes} --seeds {seeds}"
-    results = build_results(rows, command=command, seeds=list(options.seeds), floaters=options.floaters)
+    results = build_results(rows, command=options.command(), seeds=list(options.seeds), floaters=options.floaters)
     write_results(options.out / "splats.json", results)
+    wrote(options.out / "splats.json")
 
 
 if __name__ == "__main__":

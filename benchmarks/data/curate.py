@@ -2,6 +2,7 @@
 
     OMP_NUM_THREADS=1 python -m benchmarks.data.curate             (about four minutes on two idle cores)
     OMP_NUM_THREADS=1 python -m benchmarks.data.curate --quick     (half a minute, for a look)
+    OMP_NUM_THREADS=1 python -m benchmarks.data.curate --short     (the same with fewer cubes, into out/short)
 
 Mesh rows cut cubes of a generated bumpy ball: edges log-uniform, from choosing where the cube lies to its packed
 bits, no corruption. ``mesh/trimesh`` slices the mesh at the six faces of the cube and voxelises the rest, as the
@@ -23,16 +24,17 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
-import tyro
 
 from unghost.core.results import build_results, write_results
 from unghost.data_recipes.meshes.crops import sample_mesh_cubes
 from unghost.data_recipes.meshes.library import Mesh
 from unghost.data_recipes.recipe import Recipe
 
+from ..options import BenchmarkOptions, parse
+from ..progress import Plan, say, wrote
 from .cube_makers import (
     FACES,
     RECIPE,
@@ -54,26 +56,25 @@ from .cube_makers import (
     with_trimesh,
 )
 
-ROOT = Path(__file__).resolve().parents[2]
 SWEEP_FACES = (1_000, 4_000, 16_000, 70_000, 250_000, 1_000_000)
 SWEEP_EDGES = (0.01, 0.02, 0.04, 0.07, 0.1, 0.2)
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(BenchmarkOptions):
     """What to measure.
 
     Attributes:
         workers: processes.
         cubes: of the rows of this project; the others make fewer, as many as their speed allows.
         quick: a tenth of all cubes, and no mesh of more than 70,000 faces.
-        out: where curate.json and curate.png go.
     """
+
+    SHORT: ClassVar[dict[str, Any]] = {"quick": True, "cubes": 1600}
 
     workers: int = 2
     cubes: int = 16_000
     quick: bool = False
-    out: Path = ROOT / "docs" / "results"
 
 
 def agreement(found: Packed, expected: Packed) -> float:
@@ -199,20 +200,27 @@ def plot(rows: Sequence[dict[str, Any]], path: Path) -> None:
     figure.savefig(path, dpi=120)
 
 
-def main(options: Options) -> list[dict[str, Any]]:
+def main() -> None:
+    options = parse(Options, __doc__)
+    command = options.command()
     if options.quick:
         options = dataclasses.replace(options, cubes=options.cubes // 10)
+    say("checking cubes of meshes and of solids")
     check_meshes(6 if options.quick else 24)
     check_solids(4 if options.quick else 16)
-    rows = [measure(contender, options) for contender in CONTENDERS]
+    rows, plan = list[dict[str, Any]](), Plan(["row"] * (len(CONTENDERS) + 1), {"row": options.cubes / 500})
+    for contender in CONTENDERS:
+        plan.begin("row", contender.name)
+        rows.append(measure(contender, options))
+    plan.begin("row", "sweeps over faces and edge fractions")
     rows += sweeps(options, max(TOGETHER, options.cubes // 16))
-    command = "python -m benchmarks.data.curate" + " --quick" * options.quick + f" --workers {options.workers}"
     options.out.mkdir(parents=True, exist_ok=True)
     write_results(options.out / "curate.json", build_results(rows, command=command, seeds=[SEED]))
     plot(rows, options.out / "curate.png")
-    return rows
+    for row in rows:
+        say(" ".join(f"{k}={v:.3g}" if isinstance(v, float) else f"{k}={v}" for k, v in row.items()))
+    wrote(options.out / "curate.json", options.out / "curate.png")
 
 
 if __name__ == "__main__":
-    for row in main(tyro.cli(Options, description=__doc__)):
-        print(" ".join(f"{k}={v:.3g}" if isinstance(v, float) else f"{k}={v}" for k, v in row.items()))
+    main()

@@ -29,6 +29,9 @@ from unghost.data_recipes.harvest.config import HarvestConfig
 from unghost.data_recipes.inspection.drawing import GHOST, SURFACE, UNJUDGED
 from unghost.data_recipes.inspection.preview import draw_pair
 
+from ..options import HARVEST, NOT_GIVEN, give_up
+from ..progress import wrote
+
 ROOT = Path(__file__).resolve().parents[2]
 SAMPLE_CUBES = 8  # 82 kB each
 SHOWN, WIDTH, GAP = 6, 192, 8
@@ -48,7 +51,7 @@ class Options:
         docs: the folder that is written to.
     """
 
-    harvest: tyro.conf.Positional[Path]
+    harvest: tyro.conf.Positional[Path] = NOT_GIVEN
     seconds: float | None = None
     scenes: int = 0
     docs: Path = ROOT / "docs"
@@ -227,12 +230,15 @@ def page(options: Options, found: dict[str, Any], sample_bytes: int) -> str:
 
 def main() -> None:
     options = tyro.cli(Options, description=__doc__)
+    if not options.harvest.exists():
+        give_up(Options, f"needs HARVEST, {HARVEST}; there is no {options.harvest}")
     shards = [read_shard(path) for path in find_shards(options.harvest)]
     found = facts(shards)
     draw(shards, options.docs / "harvest" / "pairs.png")
     size = write_sample(generated(shards), options.docs / "harvest" / "sample")
     (options.docs / "harvest.md").write_text(page(options, found, size), encoding="utf-8")
-    print(f"{found['pairs']} pairs of {found['scenes']} scenes; look at {options.docs / 'harvest.md'}")
+    print(f"{found['pairs']} pairs of {found['scenes']} scenes")
+    wrote(options.docs / "harvest.md")
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import tyro
@@ -43,16 +43,15 @@ from unghost.data_recipes.inspection.statistics import (
 from unghost.data_recipes.pairs import make_chunk
 from unghost.data_recipes.recipe import Recipe, load_recipe
 
-from ..denoise.capture_cubes import capture_shards, cubes_folder
-from ..fit_cache import say
+from ..denoise.capture_cubes import STEPS, capture_shards, cubes_folder
+from ..options import CAPTURE, HARVEST, MESHES, NOT_GIVEN, ROOT, SAMPLE, BenchmarkOptions, given, parse
+from ..progress import say, wrote
 
-ROOT = Path(__file__).resolve().parents[2]
 SEED = 91
-ROOM_SCENES = 12
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(BenchmarkOptions):
     """What to compare.
 
     Attributes:
@@ -64,35 +63,42 @@ class Options:
         meshes: folder of meshes with a manifest.csv.
         cubes: measured of each set.
         seeds: of the capture's fields.
-        out: where statistics.json and statistics.png go.
+        rooms: scenes of the set ``rooms``.
+        fit_steps: of the capture's fields.
+        downscale: photo pixels per pixel that they are fitted to.
         cache: where fitted fields and the capture's cubes are kept.
     """
 
-    capture: tyro.conf.Positional[Path]
-    harvest: Path
+    SHORT: ClassVar[dict[str, Any]] = {
+        "harvest": SAMPLE,
+        "cubes": 12,
+        "seeds": (0,),
+        "rooms": 2,
+        "fit_steps": 10,
+        "downscale": 32,
+    }
+    DATA: ClassVar[dict[str, str]] = {"capture": CAPTURE, "harvest": HARVEST, "unseen": HARVEST, "meshes": MESHES}
+    SHORT_WITHOUT: ClassVar[tuple[str, ...]] = ("capture",)
+
+    capture: tyro.conf.Positional[Path] = NOT_GIVEN
+    harvest: Path = NOT_GIVEN
     train: str = "trajectory_1"
     better: tuple[str, ...] = ("trajectory_3",)
     unseen: Path | None = None
     meshes: Path | None = None
     cubes: int = 600
     seeds: tuple[int, ...] = (0, 1, 2)
-    out: Path = ROOT / "docs" / "results"
+    rooms: int = 12
+    fit_steps: int = STEPS
+    downscale: float = 8
     cache: Path = ROOT / "out" / "capture"
-
-    def command(self) -> str:
-        """Without anybody's paths."""
-        parts = [f"python -m benchmarks.data.harvest_statistics {self.capture.resolve().name} --train {self.train}"]
-        parts += [f"--better {' '.join(self.better)} --harvest {self.harvest.name} --cubes {self.cubes}"]
-        parts += [f"--unseen {self.unseen.name}"] if self.unseen else []
-        parts += ["--meshes MESHES"] if self.meshes else []
-        return " ".join([*parts, "--seeds", *map(str, self.seeds)])
 
 
 def by_kind(folder: Path) -> dict[str, list[Path]]:
     """The shards of a harvest, by the kind of their field."""
     kinds: dict[str, list[Path]] = {}
     for path in find_shards(folder):
-        kinds.setdefault(read_shard(path).provenance["field"], []).append(path)
+        kinds.setdefault(read_shard(path).provenance.get("field", "mixed"), []).append(path)
     return kinds
 
 
@@ -120,27 +126,33 @@ def synthetic_sets(options: Options, folder: Path) -> Iterator[tuple[str, CubeSt
         root = options.meshes if recipe.source == "meshes" else None
         shards = curate(recipe, folder / str(number), count=options.cubes, seed=SEED, mesh_root=root)
         yield name, shard_statistics(shards, most=None)
-    each = HarvestConfig(cubes=-(-options.cubes // ROOM_SCENES))
-    harvest(folder / "rooms", scenes=ROOM_SCENES, seed=SEED, fit=False, config=each, mesh_root=options.meshes)
+    each = HarvestConfig(cubes=-(-options.cubes // options.rooms))
+    harvest(folder / "rooms", scenes=options.rooms, seed=SEED, fit=False, config=each, mesh_root=options.meshes)
     yield "rooms", shard_statistics(find_shards(folder / "rooms"), most=options.cubes)
     for family in CORRUPTIONS:
         yield f"corruption {family}", corrupted(family, options.cubes)
 
 
-def all_sets(options: Options, folder: Path) -> Iterator[tuple[str, CubeStatistics]]:
-    """The capture's first."""
+def cut_shards(options: Options) -> list[Path]:
+    """Shards of the capture's fields."""
     each = -(-options.cubes // len(options.seeds))
-    cut = cubes_folder(options.cache, each)
-    shards = capture_shards(
+    return capture_shards(
         options.capture,
-        cut,
+        cubes_folder(options.cache, each, options.fit_steps, options.downscale),
         train=options.train,
         better=options.better,
         cubes=each,
         seeds=options.seeds,
         cache=options.cache,
+        steps=options.fit_steps,
+        downscale=options.downscale,
     )
-    yield "capture", shard_statistics(shards, most=options.cubes)
+
+
+def all_sets(options: Options, folder: Path) -> Iterator[tuple[str, CubeStatistics]]:
+    """The capture's first, if one is given."""
+    if given(options.capture):
+        yield "capture", shard_statistics(cut_shards(options), most=options.cubes)
     kinds = by_kind(options.harvest)
     yield "harvest", shard_statistics(list(itertools.chain(*kinds.values())), most=options.cubes)
     for kind, paths in sorted(kinds.items()):
@@ -151,10 +163,10 @@ def all_sets(options: Options, folder: Path) -> Iterator[tuple[str, CubeStatisti
 
 
 def rows_of(found: dict[str, CubeStatistics]) -> list[dict[str, Any]]:
-    """A row a set: its distance to the capture's cubes, feature by feature, and its summary."""
-    rows = []
+    """A row a set: its distance to the first set's cubes (the capture's), feature by feature, and its summary."""
+    rows, reference = [], next(iter(found.values()))
     for name, measured in found.items():
-        parts = feature_distances(measured, found["capture"])
+        parts = feature_distances(measured, reference)
         row: dict[str, Any] = {"method": name, "distance": round(float(np.mean(list(parts.values()))), 4)}
         row["distances"] = {feature: round(value, 4) for feature, value in parts.items()}
         rows.append({**row, **measured.summary()})
@@ -168,14 +180,15 @@ def draw(path: Path, found: dict[str, CubeStatistics], rows: list[dict[str, Any]
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
+    reference = next(iter(found))
     figure, axes = plt.subplots(2, 4, figsize=(16, 7.5), constrained_layout=True)
-    ordered = sorted((row for row in rows if row["method"] != "capture"), key=lambda row: -row["distance"])
+    ordered = sorted((row for row in rows if row["method"] != reference), key=lambda row: -row["distance"])
     bars = axes[0, 0]
     names = [row["method"].replace("corruption ", "") for row in ordered]
     colors = ["#2a7f62" if "harvest" in name else "#b8b8b8" for name in names]
     bars.barh(names, [row["distance"] for row in ordered], color=colors)
-    bars.axvline(floor, color="#b03a2e", linewidth=1, label="two halves of the capture's own cubes")
-    bars.set_title("distance to the capture's cubes")
+    bars.axvline(floor, color="#b03a2e", linewidth=1, label=f"two halves of the cubes of {reference}")
+    bars.set_title(f"distance to the cubes of {reference}")
     bars.tick_params(axis="y", labelsize=7)
     bars.legend(fontsize=7, loc="lower right")
     shown = {
@@ -206,18 +219,18 @@ def draw(path: Path, found: dict[str, CubeStatistics], rows: list[dict[str, Any]
 
 
 def main() -> None:
-    options = tyro.cli(Options, description=__doc__)
+    options = parse(Options, __doc__)
     found: dict[str, CubeStatistics] = {}
     with tempfile.TemporaryDirectory() as temporary:
         for name, measured in all_sets(options, Path(temporary)):
             say(f"{name}: {len(measured)} cubes")
             found[name] = measured
-    rows, floor = rows_of(found), sampling_floor(found["capture"])
+    rows, floor = rows_of(found), sampling_floor(next(iter(found.values())))
     results = build_results(
         rows,
         command=options.command(),
         seeds=[SEED, *options.seeds],
-        capture=options.capture.resolve().name,
+        capture=options.capture.resolve().name if given(options.capture) else None,
         sampling_floor=round(floor, 4),
         harvest_scenes=len(find_shards(options.harvest)),
     )
@@ -227,7 +240,8 @@ def main() -> None:
     for row in rows:
         agreement = f"  IoU with the truth {row['iou']['mean']:.3f}" if "iou" in row else ""
         say(f"{row['method']:34s} distance {row['distance']:.3f}{agreement}")
-    say(f"two halves of the capture's cubes  {floor:.3f}")
+    say(f"two halves of the cubes of {next(iter(found))}  {floor:.3f}")
+    wrote(options.out / "statistics.json", options.out / "statistics.png")
 
 
 if __name__ == "__main__":

@@ -33,12 +33,14 @@ from unghost.data_recipes.harvest.run import harvest_cubes
 from unghost.evaluation.captures.loading import load_capture
 from unghost.evaluation.scoring.depths import optical_depth
 
-from ..fit_cache import FitCache, code_hash, file_hash, say
+from ..fit_cache import FitCache, code_hash, file_hash
+from ..progress import say
 from ..two_trajectory.real_capture import Options as CaptureOptions
 from ..two_trajectory.real_capture import fit_field, render
 from ..two_trajectory.scenes import Sweep
 
 STEPS = 360  # of fitting a field, as in docs/results/capture.json
+DOWNSCALE = 8.0  # photo pixels per pixel that it is fitted to
 VOTES = 2
 LOOSE = 0.004  # of the depth: what half a pixel is off on a slanted surface
 
@@ -88,14 +90,24 @@ class PseudoTruth:
         return labels
 
 
-def cubes_folder(cache: Path, cubes: int) -> Path:
+def cubes_folder(cache: Path, cubes: int, steps: int = STEPS, downscale: float = DOWNSCALE) -> Path:
     """Where so many cubes a seed are kept, under the hash of the rules that cut and label them."""
     rules = "".join(file_hash(source)[:6] for source in (__file__, harvest_module.__file__, labels_module.__file__))
-    return cache / f"cubes-{cubes}-{rules}"
+    fits = "" if (steps, downscale) == (STEPS, DOWNSCALE) else f"-{steps}-{downscale:g}"
+    return cache / f"cubes-{cubes}{fits}-{rules}"
 
 
 def capture_shards(
-    capture: Path, out: Path, *, train: str, better: tuple[str, ...], cubes: int, seeds: tuple[int, ...], cache: Path
+    capture: Path,
+    out: Path,
+    *,
+    train: str,
+    better: tuple[str, ...],
+    cubes: int,
+    seeds: tuple[int, ...],
+    cache: Path,
+    steps: int = STEPS,
+    downscale: float = DOWNSCALE,
 ) -> list[Path]:
     """Cut cubes out of fields fitted to the sweep ``train``, one shard a seed.
 
@@ -107,8 +119,10 @@ def capture_shards(
         cubes: a seed.
         seeds: of fits and cubes.
         cache: where fitted fields are kept.
+        steps: of fitting each.
+        downscale: photo pixels per pixel that they are fitted to.
     """
-    options = CaptureOptions(capture, train, better[0], steps=STEPS, cache=cache)
+    options = CaptureOptions(capture, train, better[0], steps=steps, downscale=downscale, cache=cache)
     loaded, fits = load_capture(capture, downscale=options.downscale), FitCache(cache)
 
     def sweep(*names: str) -> Sweep:

@@ -14,7 +14,7 @@ import dataclasses
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import tyro
@@ -31,12 +31,23 @@ from unghost.prior.training.config import TrainConfig
 from unghost.prior.training.loop import train
 
 from ..compact import rounded, write_lines
-from ..fit_cache import say
+from ..options import (
+    CAPTURE,
+    HARVEST,
+    MESHES,
+    NOT_GIVEN,
+    ROOT,
+    SAMPLE,
+    SHARDS,
+    SHORT_RESULTS,
+    BenchmarkOptions,
+    parse,
+)
+from ..progress import Plan, say, wrote
 from .run import Options as Measurement
 from .run import all_sets, mean_over_severities, row_of
 from .sets import MIXED, CubeSet, blind
 
-ROOT = Path(__file__).resolve().parents[2]
 FOG = ("harvest", "harvest-unseen-field", "capture")
 BIT = "a bit"
 VARIANTS: dict[str, tuple[str, ...]] = {
@@ -51,7 +62,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(BenchmarkOptions):
     """What to train on and to measure.
 
     Attributes:
@@ -66,13 +77,29 @@ class Options:
         size: of the network: xs, s, m or l.
         seed: of the weights and of the stream of samples.
         cubes: of each set.
-        threads: of torch.
-        out: where channels.json goes.
         cache: where the capture's fields and cubes are kept.
     """
 
-    shards: tyro.conf.Positional[tuple[str, ...]]
-    meshes: Path
+    SHORT: ClassVar[dict[str, Any]] = {
+        "shards": (str(SAMPLE),),
+        "runs": SHORT_RESULTS / "channels",
+        "harvest": SAMPLE,
+        "steps": 2,
+        "batch_size": 4,
+        "size": "xs",
+        "cubes": 6,
+    }
+    DATA: ClassVar[dict[str, str]] = {
+        "shards": SHARDS,
+        "meshes": MESHES,
+        "harvest": HARVEST,
+        "unseen": HARVEST,
+        "capture": CAPTURE,
+    }
+    SHORT_WITHOUT: ClassVar[tuple[str, ...]] = ("meshes",)
+
+    shards: tyro.conf.Positional[tuple[str, ...]] = ()
+    meshes: Path = NOT_GIVEN
     runs: Path = ROOT / "out" / "channels"
     harvest: Path | None = None
     unseen: Path | None = None
@@ -82,23 +109,7 @@ class Options:
     size: str = "s"
     seed: int = 0
     cubes: int = 200
-    threads: int = 2
-    out: Path = ROOT / "docs" / "results"
     cache: Path = ROOT / "out" / "capture"
-
-    def command(self) -> str:
-        """Without anybody's paths."""
-        shards = " ".join(Path(spec).name for spec in self.shards)
-        sets = "".join(
-            f" --{name} {getattr(self, name).resolve().name}"
-            for name in ("harvest", "unseen", "capture")
-            if getattr(self, name)
-        )
-        return (
-            f"python -m benchmarks.denoise.channels_study {shards} --meshes {self.meshes.name}{sets} --steps "
-            f"{self.steps} "
-            f"--batch-size {self.batch_size} --size {self.size} --cubes {self.cubes}"
-        )
 
 
 def as_bits(signed: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
@@ -133,7 +144,7 @@ def trained(variant: str, options: Options, shards: Sequence[tuple[str | Path, f
     """The model of a variant, trained unless it is there."""
     folder = options.runs / variant.replace(" ", "-").replace(",", "")
     model = folder / "model.safetensors"
-    if not model.exists():
+    if options.short or not model.exists():
         network = dataclasses.replace(SIZES[options.size], channels=VARIANTS[variant])
         config = TrainConfig(
             name=f"study {variant}",
@@ -145,7 +156,7 @@ def trained(variant: str, options: Options, shards: Sequence[tuple[str | Path, f
             validate_seconds=0.0,
         )
         used = bit_shards(shards, options.runs / "bits") if variant == BIT else shards
-        train(config, train_shards=used, out=folder, resume=True)
+        train(config, train_shards=used, out=folder, resume=not options.short)
     return model
 
 
@@ -175,15 +186,19 @@ def wanted_sets(options: Options) -> list[CubeSet]:
         capture=options.capture,
         cubes=options.cubes,
         cache=options.cache,
-    )
+        short=options.short,
+    ).shortened()
     return [cubes for cubes in all_sets(measurement) if cubes.about.get("family", MIXED) == MIXED]
 
 
 def main() -> None:
-    options = tyro.cli(Options, description=__doc__)
-    options = dataclasses.replace(options, meshes=options.meshes.resolve())
+    options = parse(Options, __doc__)
     shards = [pair for spec in options.shards for pair in expand_shards(spec)]
-    models = {variant: trained(variant, options, shards) for variant in VARIANTS}
+    plan = Plan(["train"] * len(VARIANTS), {"train": 0.3 * options.steps})
+    models = {}
+    for variant in VARIANTS:
+        plan.begin("train", f"{options.steps} steps with {variant}")
+        models[variant] = trained(variant, options, shards)
     sets, rows = wanted_sets(options), list[dict[str, Any]]()
     for variant, model in models.items():
         rows += rows_of(variant, model, sets)
@@ -204,6 +219,7 @@ def main() -> None:
                 batch_size=options.batch_size,
             ),
         )
+    wrote(options.out / "channels.json")
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
     python -m benchmarks.denoise.run --meshes MESHES --harvest out/harvest-val --unseen out/harvest-mlp --capture
     CAPTURE
+    python -m benchmarks.denoise.run --short       procedural cubes where no meshes are given, the sample of the harvest
 
 Sets (``sets.py``): ``clean`` and ``synthetic`` (bits: cubes of meshes of the ``test`` split, every family of
 corruption at five severities, and ``mixed`` as recipes have it), ``synthetic-soft``, ``harvest`` (fields fitted to
@@ -14,13 +15,11 @@ best of a few; one that takes optional channels also without them (``NAME, blind
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
-import tyro
 from numpy.typing import NDArray
 
 from unghost import load_denoiser
@@ -31,19 +30,21 @@ from unghost.core.results import build_results
 from unghost.core.shards.packing import dequantize_share, dequantize_signed
 
 from ..compact import rounded, write_lines
-from ..fit_cache import file_hash, say
+from ..fit_cache import file_hash
+from ..options import CAPTURE, HARVEST, MESHES, NOT_GIVEN, ROOT, SAMPLE, BenchmarkOptions, given, parse
+from ..progress import say, wrote
+from .capture_cubes import DOWNSCALE, STEPS
 from .figure import draw
 from .scores import score
 from .sets import MIXED, SEED, SEVERITIES, CubeSet, blind, capture_set, harvest_set, mesh_sets, tells_more
-from .speed import UNTRAINED, Model, speed_row, untrained_rows
+from .speed import SECONDS, UNTRAINED, Model, speed_row, untrained_rows
 
-ROOT = Path(__file__).resolve().parents[2]
 WEIGHTS = ROOT / "unghost" / "weights"
 TIMESTEPS = (100, 300, 500, 700, 999)
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(BenchmarkOptions):
     """What to measure.
 
     Attributes:
@@ -53,37 +54,34 @@ class Options:
         capture: folder of a real capture.
         models: of those to compare, NAME=FILE (.onnx or .safetensors); ``unghost`` is the shipped one.
         cubes: of each set; a tenth as many of each single family of corruption and severity.
-        threads: of onnxruntime and torch, for the speed.
         timesteps: of diffusions, also score all sets at these (a row each, named NAME@t).
         untrained: of ``denoise_speed.UNTRAINED``: networks that have no weights, for a row with their speed.
-        out: where denoise.json and denoise.png go.
+        seconds: of timing each model, at least.
+        fits: of the capture: how many fields, steps of each, photo pixels per pixel.
         cache: where the capture's fields and cubes are kept.
     """
 
-    meshes: Path
+    SHORT: ClassVar[dict[str, Any]] = {
+        "harvest": SAMPLE,
+        "models": ("unghost=default", "xs=xs"),
+        "cubes": 8,
+        "seconds": 0.5,
+        "fits": (1, 10, 32),
+    }
+    DATA: ClassVar[dict[str, str]] = {"meshes": MESHES, "harvest": HARVEST, "unseen": HARVEST, "capture": CAPTURE}
+    SHORT_WITHOUT: ClassVar[tuple[str, ...]] = ("meshes",)
+
+    meshes: Path = NOT_GIVEN
     harvest: Path | None = None
     unseen: Path | None = None
     capture: Path | None = None
     models: tuple[str, ...] = ("unghost=default",)
     cubes: int = 400
-    threads: int = 2
     timesteps: tuple[int, ...] = ()
     untrained: tuple[Literal[UNTRAINED], ...] = ()  # type: ignore[valid-type]
-    out: Path = ROOT / "docs" / "results"
+    seconds: float = SECONDS
+    fits: tuple[int, int, float] = (3, STEPS, DOWNSCALE)
     cache: Path = ROOT / "out" / "capture"
-
-    def command(self) -> str:
-        """Without anybody's paths."""
-        parts = [f"python -m benchmarks.denoise.run --meshes {self.meshes.name} --cubes {self.cubes}"]
-        for name in ("harvest", "unseen", "capture"):
-            folder = getattr(self, name)
-            parts += [f"--{name} {folder.resolve().name}"] if folder else []
-        named = [f"{name}={Path(file).name}" for name, file in self.named()]
-        parts += [f"--models {' '.join(named)}"] if self.models != ("unghost=default",) else []
-        for name in ("timesteps", "untrained"):
-            values = getattr(self, name)
-            parts += [f"--{name} {' '.join(map(str, values))}"] if values else []
-        return " ".join(parts)
 
     def named(self) -> list[tuple[str, str]]:
         """Names and files of the models."""
@@ -139,12 +137,13 @@ def mean_over_severities(rows: list[dict[str, Any]], method: str) -> dict[str, A
 
 def all_sets(options: Options) -> list[CubeSet]:
     """Every set that there is a folder for."""
-    sets = list(mesh_sets(options.meshes, options.cubes, max(1, options.cubes // 10)))
+    meshes = options.meshes if given(options.meshes) else None
+    sets = list(mesh_sets(meshes, options.cubes, max(1, options.cubes // 10)))
     for name, folder in (("harvest", options.harvest), ("harvest-unseen-field", options.unseen)):
         if folder is not None:
             sets.append(harvest_set(name, folder, options.cubes))
     if options.capture is not None:
-        sets.append(capture_set(options.capture, options.cache, options.cubes))
+        sets.append(capture_set(options.capture, options.cache, options.cubes, *options.fits))
     return sets
 
 
@@ -169,7 +168,7 @@ def measure(options: Options) -> dict[str, Any]:
     """Everything; the file grows with every method."""
     methods = [(name, Classical(name)) for name in Classical.names()]
     methods += [(name, load_model(file, options.threads)) for name, file in options.named()]
-    sets, rows = all_sets(options), untrained_rows(options.untrained, options.threads)
+    sets, rows = all_sets(options), untrained_rows(options.untrained, options.threads, options.seconds)
     say(f"{sum(map(len, sets))} cubes in {len(sets)} sets, {len(methods)} methods")
     results: dict[str, Any] = {}
     files = dict(options.named())
@@ -177,7 +176,8 @@ def measure(options: Options) -> dict[str, Any]:
         name: file_hash(file) if "." in file else load_denoiser(file).manifest.body_sha256
         for name, file in files.items()
     }
-    for name, denoiser in methods:
+    for number, (name, denoiser) in enumerate(methods, 1):
+        say(f"[{number}/{len(methods)}] {name}")
         about = {"model": name} if name in files else {}
         for variant, used, timestep in variants_of(name, denoiser, options.timesteps):
             mine = [row_of(variant, used, cubes, timestep) | about for cubes in sets]
@@ -195,7 +195,9 @@ def measure(options: Options) -> dict[str, Any]:
                 if tells_more(cubes)
             ]
         if name in files:
-            rows.append(speed_row(Model.of(name, files[name], WEIGHTS), options.threads) | about)
+            rows.append(
+                speed_row(Model.of(name, files[name], WEIGHTS), options.threads, seconds=options.seconds) | about
+            )
         results = build_results(
             rows, command=options.command(), seeds=[SEED], priors=priors, severities=list(SEVERITIES)
         )
@@ -226,10 +228,10 @@ def _headline(rows: list[dict[str, Any]], method: str) -> str:
 
 
 def main() -> None:
-    options = tyro.cli(Options, description=__doc__)
-    results = measure(dataclasses.replace(options, meshes=options.meshes.resolve()))
+    options = parse(Options, __doc__)
+    results = measure(options)
     draw(options.out / "denoise.png", results["rows"])
-    say(f"{options.out / 'denoise.json'} and denoise.png")
+    wrote(options.out / "denoise.json", options.out / "denoise.png")
 
 
 if __name__ == "__main__":

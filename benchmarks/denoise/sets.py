@@ -171,23 +171,20 @@ def bubble_sets(clean: CubeSet) -> Iterator[CubeSet]:
         yield as_in_a_field(bubbles)
 
 
-def mesh_sets(meshes: Path, count: int, few: int) -> Iterator[CubeSet]:
+def mesh_sets(meshes: Path | None, count: int, few: int) -> Iterator[CubeSet]:
     """Cubes of meshes of the ``test`` split: untouched, with bubbles, corrupted as bits, and as soft opacities.
 
     Args:
-        meshes: folder with a manifest.csv.
+        meshes: folder with a manifest.csv; None: procedural cubes in place of meshes'.
         count: cubes of the mixed corruption and of the untouched.
         few: cubes of each single family.
     """
     base = dataclasses.replace(
-        load_recipe("meshes"),
-        split="test",
-        licences=("CC0-1.0", "MIT-0", "CC-BY-3.0"),
-        empty_share=0.0,
-        on_share=0.8,
-        near_share=0.2,
-        cubes_per_mesh=4,
+        load_recipe("procedural" if meshes is None else "meshes"), empty_share=0.0, on_share=0.8, near_share=0.2
     )
+    if meshes is not None:
+        licences = ("CC0-1.0", "MIT-0", "CC-BY-3.0")
+        base = dataclasses.replace(base, split="test", licences=licences, cubes_per_mesh=4)
     with tempfile.TemporaryDirectory() as folder:
 
         def cut(name: str, **changes: Any) -> CubeSet:
@@ -215,15 +212,17 @@ def harvest_set(name: str, folder: Path, count: int) -> CubeSet:
     return from_shards(name, [read_shard(path) for path in find_shards(folder)], count)
 
 
-def capture_set(capture: Path, cache: Path, count: int) -> CubeSet:
-    """Cubes of fields of a real capture (its first sweep), three seeds, labelled by a field that saw the third too."""
+def capture_set(capture: Path, cache: Path, count: int, fields: int, steps: int, downscale: float) -> CubeSet:
+    """Cubes of fields of a real capture (its first sweep), a seed each, labelled by a field that saw the third too."""
     shards = capture_shards(
         capture,
-        cubes_folder(cache, CAPTURE_CUBES),
+        cubes_folder(cache, CAPTURE_CUBES, steps, downscale),
         train="trajectory_1",
         better=("trajectory_3",),
         cubes=CAPTURE_CUBES,
-        seeds=(0, 1, 2),
+        seeds=tuple(range(fields)),
         cache=cache,
+        steps=steps,
+        downscale=downscale,
     )
     return from_shards("capture", [read_shard(path) for path in shards], count)

@@ -12,7 +12,7 @@ from unghost.core.manifest import Manifest
 from unghost.export.container import precision_of
 from unghost.speed import measure_speed
 
-from ..fit_cache import say
+from ..progress import say
 
 BATCH, SECONDS = 40, 8.0
 UNTRAINED = ("unet-epsilon", "l")  # as `train_diffusion.py` and `unghost train --size` name them
@@ -45,17 +45,18 @@ class Model:
         return cls(name, scored, scored, checkpoint if checkpoint.is_file() else None)
 
 
-def speed_row(model: Model, threads: int, **about: Any) -> dict[str, Any]:
+def speed_row(model: Model, threads: int, *, seconds: float | None = None, **about: Any) -> dict[str, Any]:
     """Cubes a second through onnxruntime and torch, one after the other with as many threads each."""
+    seconds = SECONDS if seconds is None else seconds
     row: dict[str, Any] = {"method": model.name, "set": "speed", "threads": threads, **about}
     row["megabytes"] = model.scored.stat().st_size / 1e6
     if model.checkpoint is not None:
         in_torch = _InTorch(model.checkpoint, threads)
         row |= _facts(in_torch.manifest)
-        row["torch_cubes_per_second"] = measure_speed(in_torch, batch=BATCH, seconds=SECONDS)["cubes_per_second"]
+        row["torch_cubes_per_second"] = measure_speed(in_torch, batch=BATCH, seconds=seconds)["cubes_per_second"]
     if model.onnx is not None:
         runtime = load_denoiser(model.onnx, threads=threads)
-        row |= _facts(runtime.manifest) | measure_speed(runtime, batch=BATCH, seconds=SECONDS)
+        row |= _facts(runtime.manifest) | measure_speed(runtime, batch=BATCH, seconds=seconds)
     return row
 
 
@@ -83,14 +84,14 @@ class _InTorch:
         return self._denoiser(self._torch.from_numpy(channels), timestep, edge_fraction).numpy()
 
 
-def untrained_rows(names: tuple[str, ...], threads: int) -> list[dict[str, Any]]:
+def untrained_rows(names: tuple[str, ...], threads: int, seconds: float | None = None) -> list[dict[str, Any]]:
     """Speed rows, marked ``trained: false``, of networks with random weights: nothing else can be said of them."""
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         for name in names:
             say(f"{name} has no weights: its speed alone")
             path = _random_weights(name, Path(folder) / f"{name}.safetensors")
-            rows.append(speed_row(Model.of(name, str(path), path.parent), threads, trained=False))
+            rows.append(speed_row(Model.of(name, str(path), path.parent), threads, seconds=seconds, trained=False))
     return rows
 
 

@@ -8,13 +8,14 @@ code by a toy method, stored in its format, scored by its command line, and comp
 
 from __future__ import annotations
 
-import argparse
 import importlib.metadata
+import importlib.util
 import json
 import os
 import subprocess
 import sys
 import tempfile
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -27,9 +28,17 @@ from unghost.evaluation.scoring.pseudo_truth import PseudoTruth, make_pseudo_tru
 from unghost.evaluation.scoring.views import Renders, Truth
 from unghost.integrations.nerfbaselines.protocol import MASKS_VARIABLE, PROTOCOLS, MaskedProtocol
 
+from ..options import BenchmarkOptions, give_up, parse
+from ..progress import say, wrote
+
 WIDTH, HEIGHT, FOCAL, WALL = 64, 48, 64.0, 4.0
 SHIFTS = (2.0, 2.6, 9.0)  # of the evaluation cameras; the last sees nothing that was seen
 NEAR = 1e-5  # nerfbaselines rounds its means to 5 places
+
+
+@dataclass(frozen=True)
+class Options(BenchmarkOptions):
+    """What to check: every protocol, or the one of the convention ``proper`` if short."""
 
 
 def cameras(shifts: tuple[float, ...]) -> Cameras:
@@ -150,20 +159,20 @@ def whole_metrics(photos: np.ndarray, colours: np.ndarray, maps: PseudoTruth) ->
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path("docs/results"))
-    options = parser.parse_args()
+    options = parse(Options, __doc__)
+    if importlib.util.find_spec("nerfbaselines") is None:
+        give_up(Options, "needs nerfbaselines in an environment of its own: make nerfbaselines")
     maps, photos, colours, depth = scene()
-    rows = []
+    rows, chosen = [], [each for each in PROTOCOLS if each.convention == "proper" or not options.short]
     with tempfile.TemporaryDirectory() as scratch:
         maps.save(Path(scratch) / "masks.npz")
-        for index, protocol in enumerate(PROTOCOLS):
+        for index, protocol in enumerate(chosen):
             if protocol.convention == "proper":  # from here on they need the cameras
                 os.environ[MASKS_VARIABLE] = str(Path(scratch) / "masks.npz")
             folder = Path(scratch) / str(index)
             folder.mkdir()
             rows.append(evaluate(folder, protocol, maps, (photos, colours, depth), Path(scratch) / "images"))
-            print(rows[-1])
+            say(str(rows[-1]))
     import nerfbaselines
 
     registered = sorted(each for each in nerfbaselines.get_supported_evaluation_protocols() if "unghost" in each)
@@ -174,7 +183,7 @@ def main() -> None:
     }
     results = build_results(rows, command="make nerfbaselines", seeds=[0], **extra)
     write_results(options.out / "nerfbaselines.json", results)
-    print(options.out / "nerfbaselines.json")
+    wrote(options.out / "nerfbaselines.json")
 
 
 if __name__ == "__main__":

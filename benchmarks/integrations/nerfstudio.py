@@ -13,39 +13,75 @@ LPIPS, which nerfacto holds for its evaluation, wants torchvision and a download
 
 from __future__ import annotations
 
-import argparse
+import importlib.util
 import json
 import statistics
 import sys
 import tempfile
 import time
+from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
-import torchmetrics.image.lpip
 
-torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity = lambda **_: torch.nn.Identity()
+from unghost.core.results import build_results, write_results
+from unghost.scenes.generator import PhotographedScene, photograph, random_scene
 
-from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig  # noqa: E402
-from nerfstudio.models.nerfacto import NerfactoModelConfig  # noqa: E402
-from PIL import Image  # noqa: E402
+from ..options import BenchmarkOptions, give_up, parse
+from ..progress import say, wrote
 
-from unghost.core.results import build_results, write_results  # noqa: E402
-from unghost.integrations.nerfstudio.model import UnghostNerfactoModelConfig, cameras_of  # noqa: E402
-from unghost.scenes.generator import PhotographedScene, photograph, random_scene  # noqa: E402
+if TYPE_CHECKING:
+    from nerfstudio.models.nerfacto import NerfactoModelConfig
 
-LOADED_BY_IMPORT = [name for name in ("unghost.regularizer.density_regularizer", "onnxruntime") if name in sys.modules]
-
-ROOT = Path(__file__).resolve().parents[2]
+HEAVY = (
+    "unghost.regularizer.density_regularizer",
+    "onnxruntime",
+)  # must not be loaded with the plug-in
 CUBES = 6  # of the paper's 40: a CPU asks three fields about each voxel
 BEND = {"k1": 0.03, "k2": -0.01, "p1": 0.001, "p2": -0.002}  # told to nerfstudio for the check of conventions alone
+
+
+@dataclass(frozen=True)
+class Options(BenchmarkOptions):
+    """What to train.
+
+    Attributes:
+        steps: of each of the two models.
+        rays: a step.
+        photos: of the room.
+        width: of the photos, 4 : 3.
+    """
+
+    SHORT: ClassVar[dict[str, Any]] = {"steps": 12, "rays": 64, "photos": 6, "width": 48}
+
+    steps: int = 60
+    rays: int = 1024
+    photos: int = 24
+    width: int = 128
+
+
+def without_lpips() -> None:
+    """Put an empty module in the place of LPIPS, which wants a download."""
+    import torchmetrics.image.lpip
+
+    torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity = lambda **_: torch.nn.Identity()
+
+
+def loaded_by_import() -> list[str]:
+    """Those of ``HEAVY`` that importing the plug-in has loaded."""
+    import unghost.integrations.nerfstudio.model  # noqa: F401
+
+    return [name for name in HEAVY if name in sys.modules]
 
 
 def write_data_set(shot: PhotographedScene, folder: Path, **lens: float) -> Path:
     """Photos and a transforms.json, as a phone app would leave them."""
     (folder / "images").mkdir(parents=True)
+    from PIL import Image
+
     frames = []
     for index, (image, pose) in enumerate(zip(shot.images, shot.cameras.camera_to_world)):
         name = f"images/frame_{index + 1:05d}.png"
@@ -60,12 +96,16 @@ def write_data_set(shot: PhotographedScene, folder: Path, **lens: float) -> Path
 
 def parsed(folder: Path) -> Any:
     """nerfstudio's reading of it: every photo for training."""
+    from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+
     config = NerfstudioDataParserConfig(data=folder, downscale_factor=1, eval_mode="all")
     return config.setup().get_dataparser_outputs(split="train")
 
 
 def pixel_error(cameras: Any) -> float:
     """Largest distance in pixels between where nerfstudio shot a ray and where our cameras see its points."""
+    from unghost.integrations.nerfstudio.model import cameras_of
+
     ours, generator = cameras_of(cameras), torch.Generator().manual_seed(0)
     worst = 0.0
     for index in range(len(ours)):
@@ -169,6 +209,7 @@ def gradients(model: Any) -> int:
 @torch.no_grad()
 def unseen(model: Any, data: Any) -> float:
     """Mean opacity over 1/100 of the box's side at points that no training camera sees."""
+    from unghost.integrations.nerfstudio.model import cameras_of
     from unghost.regularizer.visibility import ViewCounter
 
     low, high = data.scene_box.aabb.double().numpy()
@@ -179,39 +220,40 @@ def unseen(model: Any, data: Any) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--steps", type=int, default=60)
-    parser.add_argument("--rays", type=int, default=1024)
-    parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "results")
-    options = parser.parse_args()
+    options = parse(Options, __doc__)
+    if importlib.util.find_spec("nerfstudio") is None:
+        give_up(Options, "needs nerfstudio in an environment of its own: make nerfstudio")
+    without_lpips()
+    loaded = loaded_by_import()
+    from nerfstudio.models.nerfacto import NerfactoModelConfig
+
+    from unghost.integrations.nerfstudio.model import UnghostNerfactoModelConfig
+
     torch.set_num_threads(options.threads)
     rng = np.random.default_rng(3)
-    shot = photograph(rng, random_scene(rng), count=24, width=128, height=96)
+    shot = photograph(rng, random_scene(rng), count=options.photos, width=options.width, height=options.width * 3 // 4)
     with tempfile.TemporaryDirectory() as scratch:
         bent = pixel_error(parsed(write_data_set(shot, Path(scratch) / "bent", **BEND)).cameras)
         data = parsed(write_data_set(shot, Path(scratch) / "room"))
-    print(f"rays against our cameras: {pixel_error(data.cameras):.1e} pixels, {bent:.1e} with distortion", flush=True)
+    say(f"rays against our cameras: {pixel_error(data.cameras):.1e} pixels, {bent:.1e} with distortion")
     small: dict[str, Any] = {"implementation": "torch", "log2_hashmap_size": 15, "average_init_density": 0.01}
     ours = UnghostNerfactoModelConfig(**small, unghost_start=0, unghost_every=5, unghost_cubes=CUBES)
     images, rows = torch.from_numpy(shot.images), []
     for name, config in (("nerfacto", NerfactoModelConfig(**small)), ("unghost-nerfacto", ours)):
         rows.append({"method": name, **train(config, data, images, options.steps, options.rays)})
-        print(json.dumps(rows[-1]), flush=True)
-    from importlib.metadata import version
-
+        say(json.dumps(rows[-1]))
     about = {name: version(name) for name in ("nerfstudio", "nerfacc", "torch", "viser", "tyro", "protobuf")}
-    command = f"python -m benchmarks.integrations.nerfstudio --steps {options.steps} --rays {options.rays}"
     results = build_results(
         rows,
-        command=command,
+        command=options.command(),
         seeds=[0],
         installed=about,
         pixel_error=pixel_error(data.cameras),
         pixel_error_bent=bent,
-        loaded_by_import=LOADED_BY_IMPORT,
+        loaded_by_import=loaded,
     )
     write_results(options.out / "nerfstudio.json", results)
+    wrote(options.out / "nerfstudio.json")
 
 
 if __name__ == "__main__":

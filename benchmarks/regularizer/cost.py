@@ -1,6 +1,7 @@
 """What the regularizer costs: a step of score distillation, and the question which points no camera sees.
 
     python -m benchmarks.regularizer.cost CAPTURE
+    python -m benchmarks.regularizer.cost --short       the rows that need no capture, with little to do
 
 A step: 40 cubes of 32^3 of a fixed field (a room as a trilinear grid), with the shipped priors and with the paper's
 U-Net (random weights: its time does not depend on them) in the same harness; the field's own answers are timed apart.
@@ -17,7 +18,7 @@ import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -38,35 +39,46 @@ from unghost.regularizer.view_grid import ViewGrid
 from unghost.regularizer.visibility import ViewCounter
 from unghost.scenes.labelled_room.room import AABB, build_room
 
-from ..fit_cache import say
+from ..options import CAPTURE, NOT_GIVEN, BenchmarkOptions, given, parse
+from ..progress import say, wrote
 from ..timing import median_seconds
 from .filling import fill_row
 from .grid_field import GridField
-from .overhead import overhead_rows
+from .overhead import STEPS, WARM, overhead_rows
 
-ROOT = Path(__file__).resolve().parents[2]
-POINTS = 131_072
 FILLING = ("default", "views")
 UNET = "the paper's U-Net"
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(BenchmarkOptions):
     """What to time.
 
     Attributes:
         capture: folder of a capture: whose cameras to count.
         repeats: of which the median is taken; the U-Net's step is run twice.
-        threads: of torch and onnxruntime.
+        points: whose visibility is counted.
+        cubes: of a step.
         fill_steps: of an optimiser, of holes torn into a room.
-        out: where regularizer.json goes.
+        overhead_steps: of the own field's training before and while it is timed.
     """
 
-    capture: tyro.conf.Positional[Path]
+    SHORT: ClassVar[dict[str, Any]] = {
+        "repeats": 1,
+        "points": 8192,
+        "cubes": 2,
+        "fill_steps": 1,
+        "overhead_steps": (2, 2),
+    }
+    DATA: ClassVar[dict[str, str]] = {"capture": CAPTURE}
+    SHORT_WITHOUT: ClassVar[tuple[str, ...]] = ("capture",)
+
+    capture: tyro.conf.Positional[Path] = NOT_GIVEN
     repeats: int = 9
-    threads: int = 2
+    points: int = 131_072
+    cubes: int = 40
     fill_steps: int = 300
-    out: Path = ROOT / "docs" / "results"
+    overhead_steps: tuple[int, int] = (WARM, STEPS)
 
 
 def step_rows(options: Options) -> list[dict[str, Any]]:
@@ -78,21 +90,29 @@ def step_rows(options: Options) -> list[dict[str, Any]]:
     }
     unet = build_network(UNetConfig())
     denoisers[UNET] = TorchDenoiser(unet, Manifest("unet", family="diffusion", default_timestep=50))
-    cameras = load_capture(options.capture).cameras
+    cameras = load_capture(options.capture).cameras if given(options.capture) else None
     for name, denoiser in denoisers.items():
-        rows.append(step_row(name, denoiser, room, 1 if name == UNET else options.repeats))
-        if len(denoiser.manifest.channels) > 1:  # the views of each voxel are counted, too
-            told = step_row(name, denoiser, room, options.repeats, cameras)
+        rows.append(step_row(name, denoiser, room, options.cubes, 1 if name == UNET else options.repeats))
+        if cameras is not None and len(denoiser.manifest.channels) > 1:  # the views of each voxel are counted, too
+            told = step_row(name, denoiser, room, options.cubes, options.repeats, cameras)
             rows.append(told | {"method": f"{told['method']}, {len(cameras)} cameras", "cameras": len(cameras)})
         last = rows[-1]
         say(f"{last['method']}: {last['seconds']:.3f} s a step, {last['seconds_of_queries']:.3f} s of it the field's")
     return rows
 
 
-def step_row(name: str, denoiser: Any, room: GridField, repeats: int, cameras: Cameras | None = None) -> dict[str, Any]:
+def step_row(
+    name: str, denoiser: Any, room: GridField, cubes: int, repeats: int, cameras: Cameras | None = None
+) -> dict[str, Any]:
     """One denoiser; the field's forward and its share of the backward are timed without it, too."""
     regularizer = DensityRegularizer(
-        denoiser, aabb=AABB, field_pitch=room.pitch, skip_empty=False, cameras=cameras, visibility_weight=0.0
+        denoiser,
+        aabb=AABB,
+        field_pitch=room.pitch,
+        cubes=cubes,
+        skip_empty=False,
+        cameras=cameras,
+        visibility_weight=0.0,
     )
     asked: list[torch.Tensor] = []
 
@@ -145,7 +165,7 @@ def visibility_rows(options: Options) -> list[dict[str, Any]]:
     """Seconds for all points, tests a second, and how many answers differ from the exact ones."""
     cameras = load_capture(options.capture).cameras
     box = np.array([[-1.0] * 3, [1.0] * 3])
-    points = np.random.default_rng(0).uniform(box[0], box[1], (POINTS, 3))
+    points = np.random.default_rng(0).uniform(box[0], box[1], (options.points, 3))
     single, cached = torch.from_numpy(points).float(), ViewCounter(cameras, aabb=box)
     ways: dict[str, Callable[[], NDArray[Any]]] = {
         "every camera, exact": lambda: cameras.view_count(points),
@@ -169,10 +189,10 @@ def visibility_rows(options: Options) -> list[dict[str, Any]]:
         rows.append(
             {
                 "method": f"visibility, {name}",
-                "points": POINTS,
+                "points": options.points,
                 "cameras": len(cameras),
                 "seconds": seconds,
-                "tests_per_second": POINTS * len(cameras) / seconds,
+                "tests_per_second": options.points * len(cameras) / seconds,
                 "disagreement": float(((found > 0) != truth).mean()),
             }
         )
@@ -184,15 +204,16 @@ def visibility_rows(options: Options) -> list[dict[str, Any]]:
 
 
 def main() -> None:
-    options = tyro.cli(Options, description=__doc__)
+    options = parse(Options, __doc__)
     torch.set_num_threads(options.threads)
-    rows = [*visibility_rows(options), *step_rows(options)]
+    rows = [*(visibility_rows(options) if given(options.capture) else []), *step_rows(options)]
     rows += [fill_row(name, steps=options.fill_steps, target=target) for target in (None, 0.9) for name in FILLING]
-    rows += overhead_rows(options.capture, "default", threads=options.threads)
-    command = f"python -m benchmarks.regularizer.cost {options.capture.resolve().name}"
-    write_results(
-        options.out / "regularizer.json", build_results(rows, command=command, seeds=[0], threads=options.threads)
-    )
+    if given(options.capture):
+        warm, steps = options.overhead_steps
+        rows += overhead_rows(options.capture, "default", threads=options.threads, warm=warm, steps=steps)
+    results = build_results(rows, command=options.command(), seeds=[0], threads=options.threads)
+    write_results(options.out / "regularizer.json", results)
+    wrote(options.out / "regularizer.json")
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from unghost.fields.adapters.grids import cell_centers
 from unghost.regularizer.density_regularizer import DensityRegularizer
 from unghost.scenes.labelled_room.room import AABB, SHAPE, Room, build_room
 
-from ..fit_cache import say
+from ..progress import say
 from .grid_field import GridField
 
 RULE = OccupancyRule()

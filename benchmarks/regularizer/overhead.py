@@ -14,7 +14,8 @@ from unghost.fields.radiance import RadianceField
 from unghost.fields.training import train_field
 from unghost.regularizer.density_regularizer import DensityRegularizer
 
-from ..fit_cache import say, training_hooks
+from ..fit_cache import training_hooks
+from ..progress import say
 
 WARM, STEPS, DOWNSCALE = 60, 30, 8
 WAYS: dict[str, dict[str, Any] | None] = {

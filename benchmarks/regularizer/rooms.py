@@ -21,12 +21,10 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
-import tyro
 from numpy.typing import NDArray
 
 from unghost import load_denoiser
@@ -39,11 +37,12 @@ from unghost.fields.training import TrainingConfig, train_field
 from unghost.regularizer.density_regularizer import DensityRegularizer
 from unghost.scenes.generator import observers, photograph, random_scene
 
-from ..fit_cache import say, training_hooks
+from ..fit_cache import training_hooks
+from ..options import BenchmarkOptions, parse
+from ..progress import Plan, say, wrote
 
-ROOT = Path(__file__).resolve().parents[2]
 RULE = OccupancyRule()
-POINTS, VIEWS, WIDTH, NEAREST = 400_000, 8, 96, 0.05
+WIDTH, NEAREST = 96, 0.05
 FEWEST = 0.1  # of the surface: with less of it opaque, a fit has failed
 SEEN = 0.05  # scene units: how far behind what a photo shows a point still counts as shown
 WAYS: dict[str, dict[str, Any] | None] = {
@@ -58,7 +57,7 @@ WAYS: dict[str, dict[str, Any] | None] = {
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(BenchmarkOptions):
     """What to measure.
 
     Attributes:
@@ -67,9 +66,19 @@ class Options:
         resolution: of the grid that is fitted.
         fit_steps, steps: of the fit, and of the fine-tuning.
         cubes: a step.
-        threads: of torch and onnxruntime.
-        out: where dsds_rooms.json goes.
+        points: of the box that are labelled.
+        views: of the other sweep.
     """
+
+    SHORT: ClassVar[dict[str, Any]] = {
+        "rooms": (9,),
+        "resolution": 48,
+        "fit_steps": 100,
+        "steps": 3,
+        "cubes": 2,
+        "points": 20_000,
+        "views": 2,
+    }
 
     rooms: tuple[int, ...] = (7, 9, 10, 11)
     seed: int = 777
@@ -77,8 +86,8 @@ class Options:
     fit_steps: int = 450
     steps: int = 150
     cubes: int = 12
-    threads: int = 2
-    out: Path = ROOT / "docs" / "results"
+    points: int = 400_000
+    views: int = 8
 
 
 class FittedRoom:
@@ -97,11 +106,11 @@ class FittedRoom:
         self.fitting = TrainingConfig(rays=1152, sampling=sampling)
         told = self.photographed
         train_field(self.field, told.cameras, told.images, steps=options.fit_steps, seed=index, config=self.fitting)
-        self.others = observers(np.random.default_rng([options.seed, index, 1]), told.scene, count=VIEWS)
+        self.others = observers(np.random.default_rng([options.seed, index, 1]), told.scene, count=options.views)
         truth = Truth(told, self.field.aabb, observers=self.others)
-        self.points = rng.uniform(self.field.aabb[0], self.field.aabb[1], (POINTS, 3))
+        self.points = rng.uniform(self.field.aabb[0], self.field.aabb[1], (options.points, 3))
         self.before = self.opacity(self.field)
-        opaque, nothing = self.before > RULE.threshold, np.zeros((1, POINTS), dtype=bool)
+        opaque, nothing = self.before > RULE.threshold, np.zeros((1, options.points), dtype=bool)
         self.labels = truth.labels(self.points[None], self.field.field_pitch, opaque[None], nothing)[0]
 
     def failed(self) -> bool:
@@ -168,32 +177,32 @@ class FittedRoom:
 
 
 def main() -> None:
-    options = tyro.cli(Options, description=__doc__)
+    options = parse(Options, __doc__)
     torch.set_num_threads(options.threads)
     found: dict[str, list[dict[str, float]]] = {"the field": [], **{way: [] for way in WAYS}}
+    plan = Plan(["fit", *WAYS] * len(options.rooms), dict.fromkeys(("fit", *WAYS), 60.0))
     for index in options.rooms:
+        plan.begin("fit", f"room {index}: photos, fit, labels")
         room = FittedRoom(index, options)
         if room.failed():
             say(f"room {index}: nothing to score (its fit failed, or no other sweep fits in), it is left out")
+            plan.skip(WAYS)
             continue
         found["the field"].append({"room": index, **room.scores(room.field)})
         for way, settings in WAYS.items():
+            plan.begin(way, f"room {index}, {way}")
             field, record = room.tuned(settings, options.steps)
             found[way].append({"room": index, **room.scores(field), "psnr": record["psnr"]})
-            say(f"room {index}, {way}: " + " ".join(f"{k} {v:.3f}" for k, v in found[way][-1].items() if k != "room"))
+            say("    " + " ".join(f"{k} {v:.3f}" for k, v in found[way][-1].items() if k != "room"))
     if not found["the field"]:
         raise SystemExit("dsds_rooms: no room is left; give more --fit-steps, or other --rooms")
     rows = [
         {"method": way, **{k: float(np.mean([one[k] for one in each])) for k in each[0] if k != "room"}, "rooms": each}
         for way, each in found.items()
     ]
-    command = (
-        f"python -m benchmarks.regularizer.rooms --rooms {' '.join(map(str, options.rooms))} --seed {options.seed} "
-        f"--resolution {options.resolution} --fit-steps {options.fit_steps} --steps {options.steps} "
-        f"--cubes {options.cubes}"
-    )
-    results = build_results(rows, command=command, seeds=[options.seed], threads=options.threads)
+    results = build_results(rows, command=options.command(), seeds=[options.seed], threads=options.threads)
     write_results(options.out / "dsds_rooms.json", results)
+    wrote(options.out / "dsds_rooms.json")
 
 
 if __name__ == "__main__":

@@ -4,12 +4,15 @@ Prints the table of ``docs/stability.md``; every row checks the behaviour that i
 in ``losses.py``.
 
     python -m benchmarks.regularizer.stability
+    python -m benchmarks.regularizer.stability --short      float32 alone
 """
 
 from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -24,6 +27,8 @@ from unghost.regularizer.density_regularizer import DensityRegularizer
 from unghost.regularizer.losses import dsds_loss, stable_mean
 from unghost.regularizer.visibility import ViewCounter
 
+from ..options import BenchmarkOptions, parse
+from ..progress import say
 from .losses import BRAIN, LOSS_CASES, SINGLE, TYPES, Case, largest, refuses, relative, smallest
 
 BOX = np.array([[-1.0] * 3, [1.0] * 3])
@@ -302,12 +307,26 @@ def measured(case: Case, dtype: torch.dtype) -> str:
     return "–" if error is None else f"{error:.1e}"
 
 
-def table(cases: list[Case]) -> list[str]:
-    """Rows of the table; runs every check."""
-    cells = [[case.given, case.behaviour, *[measured(case, dtype) for dtype in TYPES]] for case in cases]
-    return [*HEAD, *[f"| {' | '.join(row)} |" for row in cells]]
+def row_of(case: Case, types: Sequence[torch.dtype]) -> str:
+    """One row of the table; runs its checks in ``types``."""
+    cells = [measured(case, dtype) if dtype in types else "–" for dtype in TYPES]
+    return f"| {' | '.join([case.given, case.behaviour, *cells])} |"
+
+
+@dataclass(frozen=True)
+class Options(BenchmarkOptions):
+    """What to check: every row, in float32 alone if short; nothing is written."""
+
+
+def main() -> None:
+    options = parse(Options, __doc__)
+    torch.set_num_threads(options.threads)
+    warnings.filterwarnings("ignore", message=".*density_fn returned")  # constant fields, on purpose
+    say("\n".join(HEAD))
+    for case in CASES:
+        say(row_of(case, SINGLE if options.short else TYPES))
+    say(f"\n{len(CASES)} rows hold; they belong into docs/stability.md")
 
 
 if __name__ == "__main__":
-    warnings.filterwarnings("ignore", message=".*density_fn returned")  # constant fields, on purpose
-    print("\n".join(table(CASES)))
+    main()

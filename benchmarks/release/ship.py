@@ -17,7 +17,7 @@ import dataclasses
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import tyro
@@ -32,12 +32,14 @@ from unghost.fields.adapters.grids import cell_centers, grid_density_fn
 from unghost.prior.checkpoint import load_model, save_model
 from unghost.scenes.labelled_room.room import AABB, SHAPE, build_room
 
-ROOT = Path(__file__).resolve().parents[2]
+from ..options import NOT_GIVEN, SHORT_RESULTS, BenchmarkOptions, give_up, parse
+from ..progress import say, wrote
+
 CANDIDATES = tuple(tenth / 10 for tenth in range(-6, 10))
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(BenchmarkOptions):
     """What to ship, and what to choose from.
 
     Attributes:
@@ -46,16 +48,25 @@ class Options:
         half: store the weights in half precision; the model computes in float32 all the same.
         rooms: seeds of the rooms.
         kept: share of the surface that must stay.
-        out: where threshold_NAME.json goes.
+        candidates: thresholds to try at most, of those from -.6 up to .9.
         weights: where the shipped models are.
     """
 
-    checkpoint: tyro.conf.Positional[Path]
-    name: tyro.conf.Positional[str]
+    SHORT: ClassVar[dict[str, Any]] = {
+        "checkpoint": WEIGHTS / "xs.safetensors",
+        "name": "xs",
+        "rooms": (10,),
+        "candidates": 2,
+        "weights": SHORT_RESULTS / "weights",
+    }
+    DATA: ClassVar[dict[str, str]] = {"checkpoint": "a model.safetensors of `unghost train`, and a NAME"}
+
+    checkpoint: tyro.conf.Positional[Path] = NOT_GIVEN
+    name: tyro.conf.Positional[str] = ""
     half: bool = False
     rooms: tuple[int, ...] = (10, 11, 12, 13)
     kept: float = 0.985
-    out: Path = ROOT / "docs" / "results"
+    candidates: int = len(CANDIDATES)
     weights: Path = WEIGHTS
 
 
@@ -87,9 +98,9 @@ def row_of(denoiser: Any, threshold: float, rooms: tuple[int, ...]) -> dict[str,
 def choose(denoiser: Any, options: Options) -> tuple[float, list[dict[str, Any]]]:
     """The threshold, and a row for each candidate up to the first that keeps too little."""
     rows: list[dict[str, Any]] = []
-    for threshold in CANDIDATES:
+    for threshold in CANDIDATES[: options.candidates]:
         rows.append(row_of(denoiser, threshold, options.rooms))
-        print(" ".join(f"{k}={v:.3f}" if isinstance(v, float) else v for k, v in rows[-1].items()), flush=True)
+        say(" ".join(f"{k}={v:.3f}" if isinstance(v, float) else v for k, v in rows[-1].items()))
         if rows[-1]["surface_kept"] < options.kept:
             break
     good = [row["threshold"] for row in rows if row["surface_kept"] >= options.kept]
@@ -111,23 +122,24 @@ def written(options: Options, folder: Path, threshold: float) -> dict[str, Path]
 
 def record(options: Options, rows: list[dict[str, Any]]) -> None:
     """The candidates and their scores, one file a model."""
-    rooms, half = " ".join(map(str, options.rooms)), " --half" if options.half else ""
-    command = (
-        f"python -m benchmarks.release.ship {options.checkpoint.name} {options.name}{half} --kept {options.kept:g}"
-    )
-    results = build_results(rows, command=f"{command} --rooms {rooms}", seeds=options.rooms, kept=options.kept)
+    results = build_results(rows, command=options.command(), seeds=options.rooms, kept=options.kept)
     write_results(options.out / f"threshold_{options.name}.json", results)
 
 
 def main() -> None:
-    options = tyro.cli(Options, description=__doc__)
+    options = parse(Options, __doc__)
+    if not options.name:
+        give_up(Options, "needs NAME, the name of the shipped model")
+    options.weights.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as scratch:
         threshold, rows = choose(load_denoiser(written(options, Path(scratch), 0.0)[".onnx"]), options)
         for suffix, path in written(options, Path(scratch), threshold).items():
             (options.weights / f"{options.name}{suffix}").write_bytes(path.read_bytes())
     rows = [row | {"chosen": row["threshold"] == threshold} for row in rows]
     record(options, rows)
-    print(f"{options.name}: threshold {threshold:g}")
+    say(f"{options.name}: threshold {threshold:g}")
+    files = [options.weights / f"{options.name}{suffix}" for suffix in (".safetensors", ".onnx")]
+    wrote(*files, options.out / f"threshold_{options.name}.json")
 
 
 if __name__ == "__main__":

@@ -2,8 +2,7 @@
 
 python -m benchmarks.release.train_diffusion SHARDS [SHARDS ...] --out RUNS --minutes 60
 python -m benchmarks.release.train_diffusion SHARDS --out RUNS --minutes 240 --which unet-epsilon --device cuda
-python -m benchmarks.release.train_diffusion SHARDS --out RUNS --steps 40 --batch-size 4        a look at whether they
-learn
+python -m benchmarks.release.train_diffusion --short        a few steps, into out/short/diffusion
 
 SHARDS is FOLDER or FOLDER=WEIGHT, a shard or a folder of shards. The compact runs differ from ``unghost train`` in
 nothing but the objective: network, batches, optimiser and budget are those of the restoration priors. A run that was
@@ -13,15 +12,21 @@ killed goes on with ``--resume``. Each leaves RUNS/NAME/model.safetensors and RU
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import tyro
 
 from unghost.core.shards.finding import expand_shards
 from unghost.prior.networks.restoration import SIZES
 from unghost.prior.networks.unet import UNetConfig
 from unghost.prior.training.config import TrainConfig
 from unghost.prior.training.loop import train
+
+from ..options import ROOT, SAMPLE, SHARDS, SHORT_RESULTS, BenchmarkOptions, give_up, parse
+from ..progress import Plan, say, wrote
 
 ENDLESS = 10_000_000  # steps, where the time decides
 RUNS = {
@@ -35,7 +40,50 @@ RUNS = {
 DEFAULT = ("compact-epsilon", "compact-x0", "compact-bernoulli", "unet-epsilon")
 
 
-def configured(name: str, options: argparse.Namespace) -> TrainConfig:
+@dataclass(frozen=True)
+class Options(BenchmarkOptions):
+    """What to train, and for how long.
+
+    Attributes:
+        shards: FOLDER or FOLDER=WEIGHT, as ``unghost train`` takes them.
+        out: folder of the runs, one a diffusion.
+        which: diffusions to train.
+        minutes: of each run.
+        steps: of each run, at most.
+        batch_size: cubes a step; 0: each run's own.
+        validation: NAME=SHARD, scored while it trains.
+        device: of torch.
+        precision: of the network while it trains.
+        threads: of torch; 0: torch's own choice.
+        seed: of the weights and of the stream of samples.
+        resume: go on where a run was killed.
+    """
+
+    SHORT: ClassVar[dict[str, Any]] = {
+        "shards": (str(SAMPLE),),
+        "out": SHORT_RESULTS / "diffusion",
+        "which": ("small-epsilon", "compact-x0", "compact-bernoulli"),
+        "steps": 3,
+        "batch_size": 2,
+        "threads": 2,
+    }
+    DATA: ClassVar[dict[str, str]] = {"shards": SHARDS}
+
+    shards: tyro.conf.Positional[tuple[str, ...]] = ()
+    out: Path = ROOT / "out" / "diffusion"
+    which: tuple[Literal[tuple(sorted(RUNS))], ...] = DEFAULT  # type: ignore[valid-type]
+    minutes: float = 0.0
+    steps: int = 0
+    batch_size: int = 0
+    validation: tuple[str, ...] = ()
+    device: str = "cpu"
+    precision: Literal["auto", "bf16", "fp32"] = "auto"
+    threads: int = 0
+    seed: int = 0
+    resume: bool = False
+
+
+def configured(name: str, options: Options) -> TrainConfig:
     """The run of that name with the options of the command line."""
     base = RUNS[name]
     return TrainConfig(
@@ -53,7 +101,7 @@ def configured(name: str, options: argparse.Namespace) -> TrainConfig:
     )
 
 
-def run(name: str, options: argparse.Namespace) -> str:
+def run(name: str, options: Options) -> str:
     """Train one; a line that says how its loss went."""
     losses: list[float] = []
     result = train(
@@ -70,23 +118,15 @@ def run(name: str, options: argparse.Namespace) -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("shards", nargs="+")
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--which", nargs="+", choices=sorted(RUNS), default=list(DEFAULT))
-    parser.add_argument("--minutes", type=float, default=0.0, help="for each run")
-    parser.add_argument("--steps", type=int, default=0, help="for each run")
-    parser.add_argument("--batch-size", type=int, default=0)
-    parser.add_argument("--validation", nargs="*", default=[], metavar="NAME=SHARD")
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--precision", choices=("auto", "bf16", "fp32"), default="auto")
-    parser.add_argument("--threads", type=int, default=0)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--resume", action="store_true")
-    options = parser.parse_args(argv)
+    options = parse(Options, __doc__, argv)
     if not (options.minutes or options.steps):
-        parser.error("give --minutes or --steps")
-    print("\n".join([run(name, options) for name in options.which]))
+        give_up(Options, "give --minutes or --steps")
+    guess = 60 * options.minutes or 3.0 * options.steps
+    plan = Plan(options.which, dict.fromkeys(options.which, guess))
+    for name in options.which:
+        plan.begin(name, name)
+        say(run(name, options))
+    wrote(*(options.out / name / "model.safetensors" for name in options.which))
 
 
 if __name__ == "__main__":

@@ -12,13 +12,11 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import statistics
 import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 import tyro
@@ -32,14 +30,15 @@ from unghost.prior.training.batches import Mixture
 from unghost.prior.training.config import TrainConfig
 from unghost.prior.training.run_state import Trainer
 
-from ..fit_cache import say
+from ..options import SAMPLE, SHARDS, BenchmarkOptions, parse
+from ..progress import Plan, say, wrote
+from ..timing import median_seconds
 
-ROOT = Path(__file__).resolve().parents[2]
 WARM_UP = 3
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(BenchmarkOptions):
     """What to time.
 
     Attributes:
@@ -47,26 +46,20 @@ class Options:
         sizes: of the network.
         batch_size: cubes a step.
         batches: that are timed, for the median.
-        threads: of torch.
-        out: where training_speed.json goes.
     """
 
-    shards: tyro.conf.Positional[tuple[str, ...]]
+    SHORT: ClassVar[dict[str, Any]] = {"shards": (str(SAMPLE),), "sizes": ("xs",), "batch_size": 8, "batches": 2}
+    DATA: ClassVar[dict[str, str]] = {"shards": SHARDS}
+
+    shards: tyro.conf.Positional[tuple[str, ...]] = ()
     sizes: tuple[str, ...] = ("xs", "s", "m")
     batch_size: int = 48
     batches: int = 15
-    threads: int = 2
-    out: Path = ROOT / "docs" / "results"
 
 
 def per_second(work: Callable[[], Any], options: Options) -> float:
     """Cubes a second, from the median call."""
-    durations = []
-    for _ in range(WARM_UP + options.batches):
-        begun = time.perf_counter()
-        work()
-        durations.append(time.perf_counter() - begun)
-    return options.batch_size / statistics.median(durations[WARM_UP:])
+    return options.batch_size / median_seconds(work, options.batches, warm_up=WARM_UP)[0]
 
 
 def loader_speed(mixture: Mixture, options: Options) -> float:
@@ -105,16 +98,26 @@ def row_of(size: str, channels: Sequence[str], options: Options) -> dict[str, An
 
 
 def main() -> None:
-    options = tyro.cli(Options, description=__doc__)
+    options = parse(Options, __doc__)
     torch.set_num_threads(options.threads)
     sets = (CHANNEL_NAMES[:1], CHANNEL_NAMES)
-    rows = [row_of(size, sets[0], options) | {"memory": "returned"} for size in options.sizes]
+    plan, rows = Plan([*options.sizes] * 3, dict.fromkeys(options.sizes, 60.0)), list[dict[str, Any]]()
+
+    def measure(size: str, channels: Sequence[str], memory: str) -> None:
+        plan.begin(size, f"{size}, {len(channels)} channels, freed memory {memory}")
+        rows.append(row_of(size, channels, options) | {"memory": memory})
+
+    for size in options.sizes:
+        measure(size, sets[0], "returned")
     memory = "kept" if keep_freed_memory() else "returned"
-    rows += [row_of(size, channels, options) | {"memory": memory} for size in options.sizes for channels in sets]
-    folders = " ".join(Path(spec).name for spec in options.shards)
-    command = f"python -m benchmarks.release.training_speed {folders} --sizes {' '.join(options.sizes)}"
-    results = build_results(rows, command=command, seeds=[0], threads=options.threads, batch_size=options.batch_size)
+    for size in options.sizes:
+        for channels in sets:
+            measure(size, channels, memory)
+    results = build_results(
+        rows, command=options.command(), seeds=[0], threads=options.threads, batch_size=options.batch_size
+    )
     write_results(options.out / "training_speed.json", results)
+    wrote(options.out / "training_speed.json")
 
 
 if __name__ == "__main__":

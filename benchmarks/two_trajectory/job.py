@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import copy
-import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Any, TypedDict
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,6 +19,7 @@ from unghost.fields.training import TrainingConfig, train_field
 from unghost.regularizer.density_regularizer import DensityRegularizer
 from unghost.regularizer.settings import RegularizerSettings
 
+from ..timing import Clock, Spent
 from .scenes import TrajectoryScene
 
 REACH = 3.0  # how many times the box the visibility loss goes out to
@@ -100,25 +100,6 @@ class Job:
     def fitting(self) -> TrainingConfig:
         """As the field was fitted."""
         return TrainingConfig(rays=self.scene.rays, sampling=self.scene.sampling)
-
-
-class Spent(TypedDict):
-    """Seconds by the clock and of all threads together, as the fields of :class:`Outcome` are called."""
-
-    seconds: float
-    cpu_seconds: float
-
-
-class Clock:
-    """Seconds since it was made, as the fields of :class:`Outcome` are called."""
-
-    def __init__(self) -> None:
-        self._begun = time.perf_counter(), time.process_time()
-
-    def read(self) -> Spent:
-        """By the clock, and of all threads together."""
-        now = time.perf_counter(), time.process_time()
-        return {"seconds": now[0] - self._begun[0], "cpu_seconds": now[1] - self._begun[1]}
 
 
 def add_seconds(before: Outcome, after: Spent) -> Spent:

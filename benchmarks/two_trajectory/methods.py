@@ -25,7 +25,8 @@ from unghost.fields.filtered import FilteredField
 from unghost.regularizer.removal import RemovalLoss
 from unghost.regularizer.settings import RegularizerSettings
 
-from .job import Clock, Job, Outcome, Term, add_seconds, fine_tuned, make_regularizer, visibility
+from ..timing import Clock
+from .job import Job, Outcome, Term, add_seconds, fine_tuned, make_regularizer, visibility
 from .rivals import free_space, regnerf, sparsity, total_variation
 
 PAPER_PRIOR = Path(__file__).parents[1] / "weights" / "small-epsilon.onnx"

@@ -11,27 +11,26 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
-import tyro
 
 from unghost.evaluation.report.rows import draw_comparison
 from unghost.evaluation.uncertainty.photometric import photo_doubt
 
-from ..fit_cache import FitCache, say
+from ..fit_cache import FitCache
+from ..options import CAPTURE, ROOT, SHORT_RESULTS, BenchmarkOptions, parse
+from ..progress import say, wrote
 from .job import Job, Outcome, Views, render
 from .methods import METHODS, judged
 from .run import Options as Benchmark
 from .run import fitted, stages
 from .scores import SLACK, Stage
 
-ROOT = Path(__file__).resolve().parents[2]
-
 
 @dataclass(frozen=True)
-class Options:
+class Options(BenchmarkOptions):
     """What to draw.
 
     Attributes:
@@ -41,10 +40,23 @@ class Options:
         views: rows of the picture.
         seed: of fits and rays.
         fit_steps, steps: as in the benchmark.
-        threads: of torch and onnxruntime.
-        out: where two_trajectory_views.png goes.
+        photos, width, resolution: of a synthetic scene, as in the benchmark.
+        sweep_views: of its evaluation sweep.
         cache: of the benchmark.
     """
+
+    SHORT: ClassVar[dict[str, Any]] = {
+        "scene": "room-1",
+        "views": 2,
+        "fit_steps": 40,
+        "steps": 2,
+        "photos": 8,
+        "sweep_views": 3,
+        "width": 48,
+        "resolution": 48,
+        "cache": SHORT_RESULTS / "two_trajectory",
+    }
+    DATA: ClassVar[dict[str, str]] = {"capture": CAPTURE}
 
     scene: str = "room-0"
     capture: Path | None = None
@@ -53,8 +65,10 @@ class Options:
     seed: int = 0
     fit_steps: int = 450
     steps: int = 150
-    threads: int = 2
-    out: Path = ROOT / "docs" / "results"
+    photos: int = 20
+    sweep_views: int = 10
+    width: int = 96
+    resolution: int = 96
     cache: Path = ROOT / "out" / "two_trajectory"
 
 
@@ -112,13 +126,22 @@ def draw_doubt(path: Path, stage: Stage, job: Job, views: list[int]) -> None:
 
 
 def main() -> None:
-    options = tyro.cli(Options, description=__doc__)
+    options = parse(Options, __doc__)
     torch.set_num_threads(options.threads)
     cache = FitCache(options.cache)
     scenes = () if options.capture else (options.scene,)
     benchmark = Benchmark(
-        scenes=scenes, capture=options.capture, fit_steps=options.fit_steps, steps=options.steps, cache=options.cache
-    )
+        scenes=scenes,
+        capture=options.capture,
+        fit_steps=options.fit_steps,
+        steps=options.steps,
+        photos=options.photos,
+        views=options.sweep_views,
+        width=options.width,
+        resolution=options.resolution,
+        cache=options.cache,
+        short=options.short,
+    ).shortened()
     for stage in stages(benchmark, cache):
         count = len(stage.pseudo.depth)
         views = np.unique(np.linspace(0, count - 1, options.views + 2).round().astype(int)[1:-1]).tolist()
@@ -132,10 +155,11 @@ def main() -> None:
             note=f"Below each picture its depth (warm is near; grey: nothing within the depth limit). "
             f"Seed {options.seed}, {stage.steps} steps of each method.",
         )
-        say(str(path))
         base, _ = fitted(benchmark, cache, "field", stage.scene, stage.scene.train, options.seed, stage.fit_steps)
         job = Job(stage.scene, base, options.seed, stage.steps, threads=options.threads)
-        draw_doubt(options.out / "two_trajectory_doubt.png", stage, job, views)
+        doubt = options.out / "two_trajectory_doubt.png"
+        draw_doubt(doubt, stage, job, views)
+        wrote(path, doubt)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ import dataclasses
 import functools
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import tyro
@@ -40,10 +40,11 @@ from unghost.fields.training import train_field
 from unghost.regularizer.density_regularizer import DensityRegularizer
 from unghost.regularizer.settings import RegularizerSettings
 
-from ..fit_cache import FitCache, Plan, code_hash, file_hash, say, training_hooks
+from ..fit_cache import FitCache, code_hash, file_hash, training_hooks
+from ..options import CAPTURE, NOT_GIVEN, ROOT, BenchmarkOptions, parse
+from ..progress import Plan, say, wrote
 from .scenes import Sweep
 
-ROOT = Path(__file__).resolve().parents[2]
 WITHOUT_PRIOR = {"field": "(a) fine-tuned alone", "visibility": "(b) + visibility"}
 FIGURE_VIEWS = 4
 CONVENTION = "paper_text"
@@ -51,7 +52,7 @@ Views = dict[str, NDArray[Any]]
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(BenchmarkOptions):
     """What to compare.
 
     Attributes:
@@ -69,13 +70,22 @@ class Options:
         denoisers: for (c), each a shipped name or the path of an .onnx or .safetensors file; the first one's row is
             ``dsds``, the others' ``dsds, NAME``.
         settings: of the regularizer, as name=value, e.g. dsds_weight=0.2 cubes=20.
-        out: where capture.json and capture.png go.
         cache: where fitted fields and renderings are kept; remove it to start over.
     """
 
-    capture: tyro.conf.Positional[Path]
-    train: str
-    eval: str
+    SHORT: ClassVar[dict[str, Any]] = {
+        "seeds": (0,),
+        "downscale": 32,
+        "steps": 5,
+        "finetune_steps": 2,
+        "resolution": 32,
+        "settings": ("cubes=2", "visibility_samples=1024"),
+    }
+    DATA: ClassVar[dict[str, str]] = {"capture": CAPTURE}
+
+    capture: tyro.conf.Positional[Path] = NOT_GIVEN
+    train: str = "trajectory_1"
+    eval: str = "trajectory_3"
     seeds: tuple[int, ...] = (0, 1, 2)
     downscale: float = 8
     seconds: float = 360.0
@@ -85,7 +95,6 @@ class Options:
     depth_limit: float | None = None
     denoisers: tuple[str, ...] = ("default",)
     settings: tuple[str, ...] = ()
-    out: Path = ROOT / "docs" / "results"
     cache: Path = ROOT / "out" / "capture"
 
     def command(self) -> str:
@@ -101,6 +110,7 @@ class Options:
         parts += [f"--depth-limit {self.depth_limit:g}"] if self.depth_limit else []
         named = " ".join(Path(name).name for name in self.denoisers)
         parts += [f"--denoisers {named}"] if self.denoisers != ("default",) else []
+        parts += ["--short"] if self.short else []
         return " ".join([*parts, *(["--settings", *self.settings] if self.settings else [])])
 
     def priors(self) -> dict[str, str]:
@@ -290,10 +300,10 @@ def draw(options: Options, columns: dict[str, Views], limit: float, rows: list[d
 
 
 def main() -> None:
-    options = tyro.cli(Options, description=__doc__)
+    options = parse(Options, __doc__)
     results = run(options)
     say(format_table(results["rows"]))
-    say(f"{options.out / 'capture.json'} and capture.png")
+    wrote(options.out / "capture.json", options.out / "capture.png")
 
 
 if __name__ == "__main__":

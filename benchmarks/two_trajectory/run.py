@@ -1,7 +1,7 @@
 """The two-trajectory benchmark: who takes ghosts out, at equal coverage, on scenes of which everything is known?
 
     python -m benchmarks.two_trajectory.run --capture CAPTURE      the whole: a night on two cores
-    python -m benchmarks.two_trajectory.run --short                two scenes, one seed, few steps: a quarter of an hour
+    python -m benchmarks.two_trajectory.run --short                one small scene, few steps: some minutes, out/short
     python -m benchmarks.two_trajectory.run --scenes room-0 --methods field visibility
 
 A field is fitted to one sweep of photos, every method improves it (``methods.py``) for the same steps, and
@@ -17,18 +17,16 @@ paper's ablation, ``--every-eighth`` scores every 8th photo of the first sweep. 
 
 from __future__ import annotations
 
-import dataclasses
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
-import tyro
 from filelock import FileLock
 from numpy.typing import NDArray
 
@@ -38,7 +36,9 @@ from unghost.fields.radiance import RadianceConfig, RadianceField
 from unghost.fields.rendering import render_view
 from unghost.fields.training import TrainingConfig, train_field
 
-from ..fit_cache import FitCache, Plan, say
+from ..fit_cache import FitCache
+from ..options import CAPTURE, ROOT, SHORT_RESULTS, BenchmarkOptions, parse
+from ..progress import Plan, say, wrote
 from .ablation import ABLATION
 from .compact import read_expanded, write_compact
 from .figure import write_figures
@@ -48,13 +48,11 @@ from .scenes import LabelledSpace, Sweep, TrajectoryScene, captured_scene, synth
 from .scores import CONVENTION, Stage, scored
 from .tables import FEWER_SEEDS, REFERENCE, summary_rows
 
-ROOT = Path(__file__).resolve().parents[2]
 SCENES = ("room-0", "room-1", "room-2", "room-5", "objects-4", "objects-27")
-SHORT_SCENES = ("room-1", "objects-4")
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(BenchmarkOptions):
     """What to compare.
 
     Attributes:
@@ -71,11 +69,26 @@ class Options:
         equal_seconds: a second table, every training method for as many seconds as ``visibility`` takes.
         ablation: the paper's ablation instead of the main table.
         every_eighth: score every 8th photo of the training sweep instead of the other sweep, to see what that hides.
-        short: two scenes, one seed, a third of the steps.
-        threads: of torch and onnxruntime.
-        out: where two_trajectory.json and the figures go.
+        photos, views: of the training and of the evaluation sweep of a synthetic scene.
+        width: of its photos, 4 : 3.
+        resolution: of the grid that is fitted to it.
         cache: where fitted fields are kept.
     """
+
+    SHORT: ClassVar[dict[str, Any]] = {
+        "scenes": ("room-1",),
+        "seeds": (0,),
+        "fit_steps": 40,
+        "steps": 2,
+        "capture_steps": (10, 2),
+        "downscale": 32,
+        "photos": 8,
+        "views": 3,
+        "width": 48,
+        "resolution": 48,
+        "cache": SHORT_RESULTS / "two_trajectory",
+    }
+    DATA: ClassVar[dict[str, str]] = {"capture": CAPTURE}
 
     scenes: tuple[str, ...] = SCENES
     scene_seed: int = 2026
@@ -91,16 +104,11 @@ class Options:
     equal_seconds: bool = False
     ablation: bool = False
     every_eighth: bool = False
-    short: bool = False
-    threads: int = 2
-    out: Path = ROOT / "docs" / "results"
+    photos: int = 20
+    views: int = 10
+    width: int = 96
+    resolution: int = 96
     cache: Path = ROOT / "out" / "two_trajectory"
-
-    def shortened(self) -> Options:
-        """As ``short`` says."""
-        if not self.short:
-            return self
-        return dataclasses.replace(self, scenes=SHORT_SCENES, seeds=(0,), fit_steps=150, steps=50)
 
     def names(self, seed: int = 0) -> tuple[str, ...]:
         """Methods of the table; those that do not train have nothing to do with equal seconds."""
@@ -129,7 +137,7 @@ class Ledger:
 
     def __init__(self, options: Options) -> None:
         self.options = options
-        self.path = options.out / f"two_trajectory{'_short' if options.short else ''}.json"
+        self.path = options.out / "two_trajectory.json"
         self.read()
 
     def read(self) -> None:
@@ -230,7 +238,14 @@ def fitted(
 def stages(options: Options, cache: FitCache) -> Iterator[Stage]:
     """The scenes, one after the other; a capture's truth is that of a field trained on both sweeps."""
     for name in options.scenes:
-        scene = synthetic_scene(options.scene_seed, name)
+        scene = synthetic_scene(
+            options.scene_seed,
+            name,
+            photos=options.photos,
+            views=options.views,
+            width=options.width,
+            resolution=options.resolution,
+        )
         scene = scene.every_nth() if options.every_eighth else scene
         pseudo = scene.pseudo(lambda cameras: np.zeros(0))
         yield Stage(scene, pseudo, scene.truth(pseudo), options.fit_steps, options.steps)
@@ -296,9 +311,12 @@ def run_stage(options: Options, stage: Stage, cache: FitCache, ledger: Ledger, p
 
 
 def main() -> None:
-    options = tyro.cli(Options, description=__doc__).shortened()
+    options = parse(Options, __doc__)
     torch.set_num_threads(options.threads)
     cache, ledger = FitCache(options.cache), Ledger(options)
+    if options.short and options.out == SHORT_RESULTS:  # does its work anew
+        ledger.path.unlink(missing_ok=True)
+        ledger.read()
     count = len(options.scenes) + (options.capture is not None)
     names = [name for seed in options.seeds for name in options.names(seed)]
     plan = Plan(names * count, dict.fromkeys(names, 40.0))
@@ -306,7 +324,8 @@ def main() -> None:
     for stage in stages(options, cache):
         run_stage(options, stage, cache, ledger, plan)
     write_figures(ledger.path)
-    say(f"{ledger.path} and its figures, {(time.perf_counter() - begun) / 60:.0f} min")
+    say(f"{(time.perf_counter() - begun) / 60:.1f} min")
+    wrote(ledger.path, ledger.path.with_suffix(".png"))
 
 
 if __name__ == "__main__":

@@ -23,7 +23,8 @@ from unghost.evaluation.scoring.views import Renders, Truth
 from unghost.evaluation.uncertainty.photometric import photo_doubt
 from unghost.evaluation.uncertainty.sparsification import sparsify
 
-from .job import Clock, Outcome, Spent, Views, add_seconds, render
+from ..timing import Clock, Spent
+from .job import Outcome, Views, add_seconds, render
 from .scenes import LabelledSpace, TrajectoryScene
 
 CONVENTION = "proper"

@@ -16,16 +16,17 @@ import dataclasses
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
-import tyro
 
 from unghost.core.results import build_results, json_ready
 
 from ..compact import write_lines
-from ..fit_cache import FitCache, say
+from ..fit_cache import FitCache
+from ..options import ROOT, SHORT_RESULTS, BenchmarkOptions, parse
+from ..progress import Plan, say, wrote
 from .compact import compact_rows
 from .job import Job, Weights
 from .methods import FACTOR_OF, METHODS
@@ -35,7 +36,6 @@ from .scenes import synthetic_scene
 from .scores import Stage, scored
 from .tables import summary_rows
 
-ROOT = Path(__file__).resolve().parents[2]
 FACTORS = {
     "sparsity": (1e-4, 1e-3, 1e-2, 1e-1),
     "tv": (1e-3, 1e-2, 1e-1, 1.0),
@@ -49,26 +49,41 @@ WITHIN_DB = 0.1
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(BenchmarkOptions):
     """What to try.
 
     Attributes:
         scenes: by kind and number of the seed's.
         scene_seed: not the benchmark's.
         losses: whose factors; all if left out.
+        factors: tried of each loss, at most.
         fit_steps, steps: as in the benchmark.
-        threads: of torch.
-        out: where the results go.
+        photos, views, width, resolution: of a scene, as in the benchmark.
         cache: where fitted fields are kept.
     """
+
+    SHORT: ClassVar[dict[str, Any]] = {
+        "scenes": ("room-1",),
+        "factors": 2,
+        "fit_steps": 40,
+        "steps": 2,
+        "photos": 8,
+        "views": 3,
+        "width": 48,
+        "resolution": 48,
+        "cache": SHORT_RESULTS / "two_trajectory",
+    }
 
     scenes: tuple[str, ...] = ("room-1", "objects-3")
     scene_seed: int = 555
     losses: tuple[str, ...] = tuple(FACTORS)
     fit_steps: int = 450
     steps: int = 150
-    threads: int = 2
-    out: Path = ROOT / "docs" / "results"
+    factors: int = 4
+    photos: int = 20
+    views: int = 10
+    width: int = 96
+    resolution: int = 96
     cache: Path = ROOT / "out" / "two_trajectory"
 
 
@@ -92,25 +107,33 @@ def chosen_factors(rows: list[dict[str, Any]]) -> dict[str, str]:
 
 
 def main() -> None:
-    options = tyro.cli(Options, description=__doc__)
+    options = parse(Options, __doc__)
     torch.set_num_threads(options.threads)
     cache, cells = FitCache(options.cache), list[dict[str, Any]]()
+    tried = [loss for loss in options.losses for _ in FACTORS[loss][: options.factors]]
+    plan = Plan(tried * len(options.scenes), dict.fromkeys(options.losses, 30.0))
     for name in options.scenes:
-        scene = synthetic_scene(options.scene_seed, name)
+        scene = synthetic_scene(
+            options.scene_seed,
+            name,
+            photos=options.photos,
+            views=options.views,
+            width=options.width,
+            resolution=options.resolution,
+        )
         pseudo = scene.pseudo(lambda cameras: np.zeros(0))
         stage = Stage(scene, pseudo, scene.truth(pseudo), options.fit_steps, options.steps)
         base, _ = fitted(Benchmark(), cache, "field", scene, scene.train, 0, options.fit_steps)
         for loss in options.losses:
             method = METHODS[next(name for name, factor in FACTOR_OF.items() if factor == loss)]
-            for factor in FACTORS[loss]:
+            for factor in FACTORS[loss][: options.factors]:
+                plan.begin(loss, f"{name}, {loss} {factor:g}")
                 weights = dataclasses.replace(Weights(), **{loss: factor})
                 job = Job(scene, base, 0, options.steps, threads=options.threads, weights=weights)
                 row = scored(stage, method(job)[0], None, headline=False)
                 cells.append({"table": loss, "scene": name, "seed": 0, "method": f"{factor:g}", **row})
-                say(
-                    f"{name} {loss} {factor:g}: psnr {row['psnr']:.2f} coverage {row['coverage']:.3f} "
-                    f"disparity {row['disparity_mae']:.3f}"
-                )
+                said = {key: row[key] for key in ("psnr", "coverage", "disparity_mae") if row[key] is not None}
+                say("    " + " ".join(f"{key} {value:.3f}" for key, value in said.items()))
     path = options.out / "two_trajectory_sweep.json"
     stored = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"rows": []}
     rows = [{**row, "method": f"{row['table']} {row['method']}"} for row in summary_rows(cells)]
@@ -122,14 +145,14 @@ def main() -> None:
             f"{row['method']}: {row['psnr_at_coverage']:.3f} dB at {row['at_coverage']:.3f}, disparity "
             f"{row['disparity_mae_at_coverage']:.4f}{' *' * row['chosen']}"
         )
-    command = f"python -m benchmarks.two_trajectory.sweep --scenes {' '.join(options.scenes)}"
-    named = " ".join(options.losses)
+    command = options.command()
     if options.losses != tuple(FACTORS):
-        command = " ; ".join([stored.get("command", ""), *([f"{command} --losses {named}"] if named else [])])
+        command = " ; ".join([stored.get("command", ""), *([command] if options.losses else [])])
     results = build_results(
         compact_rows(rows), command=command, seeds=[0], scene_seed=options.scene_seed, threads=options.threads
     )
     write_lines(path, json_ready(results))
+    wrote(path)
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
+from unghost_tests.benches import check_short
 
 from benchmarks.data import cube_makers, curate
 
@@ -94,3 +95,7 @@ def test_rows_sweeps_and_picture(bench, tmp_path):
     assert (tmp_path / "curate.png").stat().st_size > 5000
     bench.write_results(tmp_path / "curate.json", bench.build_results(rows, seeds=[bench.SEED]))
     assert len(json.loads((tmp_path / "curate.json").read_text())["rows"]) == len(rows)
+
+
+def test_short():
+    check_short(curate, quick=True, cubes=1600)

@@ -1,14 +1,13 @@
 """The sample of a harvest that docs hold: few cubes, of every kind of field."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
+from unghost_tests.benches import refusal
 
 from benchmarks.data import harvest_page
+from benchmarks.options import SAMPLE
 from unghost.core.shards.storage import read_shard
-
-SAMPLE = Path(__file__).parents[3] / "docs" / "harvest" / "sample"
 
 
 def scenes(*fields):
@@ -42,3 +41,15 @@ def test_a_sample_has_one_cube_a_scene_and_every_kind(tmp_path, monkeypatch):
     assert all((cube == best).all() for cube in sample.inputs)  # every scene has the same cubes, in another order
     harvest_page.write_sample(shards, tmp_path / "sample")  # replaces what is there
     assert len(read_shard(tmp_path / "sample")) == 3
+
+
+def test_what_is_missing(monkeypatch, capsys):
+    assert "needs HARVEST" in refusal(harvest_page, monkeypatch, capsys)
+    assert "there is no nowhere" in refusal(harvest_page, monkeypatch, capsys, "nowhere")
+
+
+def test_a_row_of_pictures(monkeypatch):
+    monkeypatch.setattr(harvest_page, "WIDTH", 32)
+    pictures = harvest_page.draw_row(read_shard(SAMPLE), 0)
+    assert len(pictures) == len(harvest_page.HEADINGS)
+    assert all(np.asarray(picture).shape == (harvest_page.WIDTH, harvest_page.WIDTH, 3) for picture in pictures)

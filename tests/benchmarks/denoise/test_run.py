@@ -7,6 +7,8 @@ pytest.importorskip("scipy")
 pytest.importorskip("torch")
 pytest.importorskip("tyro")
 
+from unghost_tests.benches import check_short, refusal
+
 from benchmarks.denoise import capture_cubes, channels_study, figure, run, scores, sets, speed
 from unghost.baselines import filters
 from unghost.core.cameras import Cameras
@@ -312,3 +314,15 @@ def test_bubbles_are_whole_ghosts_clear_of_the_surface(parts):
     assert (bits.labels == clean.labels).all()
     again = next(parts["sets"].bubble_sets(clean))
     np.testing.assert_array_equal(bits.signed, again.signed)
+
+
+def test_short_and_what_is_missing(monkeypatch, capsys, tmp_path):
+    check_short(run, cubes=8)
+    assert "needs MESHES" in refusal(run, monkeypatch, capsys)
+    assert "no nowhere" in refusal(run, monkeypatch, capsys, "--meshes", tmp_path, "--unseen", "nowhere")
+
+
+def test_without_meshes_the_sets_are_of_procedural_cubes(parts):
+    found = list(parts["sets"].mesh_sets(None, 2, 1))
+    assert {cubes.name for cubes in found} >= {"clean", "bubbles", "synthetic", "synthetic-soft"}
+    assert all(len(cubes) in (1, 2) for cubes in found)

@@ -2,6 +2,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from unghost_tests.benches import check_short
 
 from benchmarks.regularizer import stability as STABILITY
 
@@ -54,3 +55,11 @@ def test_checks_can_fail():
         STABILITY.raises(1.0, torch.float32)
     with pytest.raises(AssertionError, match="no ValueError"):
         STABILITY.refuses(lambda: None, ValueError, "anything")
+
+
+def test_short_checks_one_type(monkeypatch, capsys):
+    check_short(STABILITY)
+    checked = []
+    case = STABILITY.Case("a case", "behaves", checked.append, TYPES)
+    assert STABILITY.row_of(case, TYPES[:1]) == "| a case | behaves | – | – | – |"
+    assert checked == [torch.float32]

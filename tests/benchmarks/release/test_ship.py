@@ -9,6 +9,8 @@ import torch
 
 pytest.importorskip("tyro")
 
+from unghost_tests.benches import check_short, refusal
+
 from benchmarks.release import ship
 from unghost import load_denoiser
 from unghost.core.manifest import Manifest
@@ -59,3 +61,10 @@ def test_the_files_hold_the_threshold_and_agree(options, half, monkeypatch, tmp_
     assert difference < 1e-5  # the very same weights, halved or not
     rows = json.loads((tmp_path / "threshold_mine.json").read_text(encoding="utf-8"))["rows"]
     assert [row["threshold"] for row in rows if row["chosen"]] == [0.1]
+
+
+def test_short_ships_nothing_and_what_is_missing(monkeypatch, capsys, tmp_path):
+    check_short(ship, name="xs")
+    assert ship.Options(short=True).shortened().weights != ship.WEIGHTS
+    assert "needs CHECKPOINT" in refusal(ship, monkeypatch, capsys)
+    assert "needs NAME" in refusal(ship, monkeypatch, capsys, tmp_path)

@@ -3,6 +3,7 @@
 import json
 
 import pytest
+from unghost_tests.benches import parsed, refusal
 
 from benchmarks.release import train_diffusion
 from unghost.prior.checkpoint import load_model
@@ -43,7 +44,13 @@ def test_compact_runs_differ_in_the_objective_alone(bench):
     assert bench.PUBLISHED["unet-epsilon"].network == UNetConfig()
 
 
-def test_a_budget_is_needed(bench, tmp_path, capsys):
+def test_a_budget_is_needed(bench, shard_paths, tmp_path, capsys):
     with pytest.raises(SystemExit):
-        bench.main(["shards", "--out", str(tmp_path)])
+        bench.main([str(shard_paths["a"]), "--out", str(tmp_path)])
     assert "give --minutes or --steps" in capsys.readouterr().err
+
+
+def test_short_and_what_is_missing(monkeypatch, capsys):
+    short = parsed(train_diffusion, "--short")
+    assert {name: getattr(short, name) for name in short.SHORT} == short.SHORT
+    assert "needs SHARDS" in refusal(train_diffusion, monkeypatch, capsys)

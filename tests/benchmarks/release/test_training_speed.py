@@ -8,6 +8,8 @@ import pytest
 pytest.importorskip("torch")
 pytest.importorskip("tyro")
 
+from unghost_tests.benches import check_short, refusal
+
 from benchmarks.release import training_speed
 
 
@@ -45,3 +47,9 @@ def test_loader_network_and_both(shard_paths, tmp_path, monkeypatch):
         )
         assert row["training_cubes_per_second"] > 0
     assert str(tmp_path) not in json.dumps(found)
+
+
+def test_short_and_what_is_missing(monkeypatch, capsys):
+    check_short(training_speed, sizes=("xs",))
+    assert "needs SHARDS" in refusal(training_speed, monkeypatch, capsys)
+    assert "no nowhere" in refusal(training_speed, monkeypatch, capsys, "nowhere=.5")

@@ -8,6 +8,8 @@ from PIL import Image
 
 pytest.importorskip("torch")
 
+from unghost_tests.benches import refusal
+
 from benchmarks.two_trajectory import real_capture
 from unghost.core.manifest import Manifest
 
@@ -157,3 +159,11 @@ def test_the_command_names_no_folder(bench, capture, tmp_path):
         "--finetune-steps 2 "
         "--steps 3 --resolution 16 --settings cubes=1 visibility_samples=64"
     )
+
+
+def test_short_and_what_is_missing(monkeypatch, capsys, capture, tmp_path):
+    short = real_capture.Options(capture, short=True).shortened()
+    assert {name: getattr(short, name) for name in short.SHORT} == short.SHORT
+    assert " --short" in short.command()
+    assert "needs CAPTURE" in refusal(real_capture, monkeypatch, capsys)
+    assert "no nowhere" in refusal(real_capture, monkeypatch, capsys, "nowhere", "--short")

@@ -10,6 +10,8 @@ import pytest
 
 pytest.importorskip("torch")
 
+from unghost_tests.benches import check_short, refusal
+
 ROOT = Path(__file__).parents[3]
 PARTS = {
     "fit_cache": "benchmarks.fit_cache",
@@ -354,3 +356,8 @@ def test_unseen_patches_lie_between_the_cameras(bench):
     assert (starts == starts[:, :1, :1]).all()  # one camera a patch
     gap = towards[:, 1:, 1:] - towards[:, :-1, :-1]
     assert 0 < float(gap.norm(dim=-1).max()) < 0.2  # neighbouring rays
+
+
+def test_short_and_what_is_missing(bench, monkeypatch, capsys):
+    check_short(bench["two_trajectory"], scenes=("room-1",), seeds=(0,))
+    assert "no nowhere" in refusal(bench["two_trajectory"], monkeypatch, capsys, "--capture", "nowhere")
