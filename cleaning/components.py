@@ -29,6 +29,13 @@ def label_components(occupied: Mask, *, connectivity: int = 26) -> tuple[NDArray
     Returns:
         labels ``(X, Y, Z)``: 0 where empty, else 1 … count, in the order of each component's first voxel
         (C order, as scipy's); and the count.
+
+    Example:
+        >>> occupied = np.zeros((4, 4, 4), dtype=bool)
+        >>> occupied[0, 0, :2] = occupied[3, 3, 3] = True
+        >>> labels, count = label_components(occupied)
+        >>> count, labels[0, 0].tolist()
+        (2, [1, 1, 0, 0])
     """
     padded = np.pad(occupied, 1)  # so that a step never leaves the grid
     cells = np.flatnonzero(padded)

@@ -162,6 +162,12 @@ def make_chunk(recipe: Recipe, seed: int, mesh_root: str | None, start: int, sto
     Raises:
         SampleError: one of them could not be made.
         ImportError: a missing extra.
+
+    Example:
+        >>> from unghost.data_recipes.recipe import load_recipe
+        >>> chunk = make_chunk(load_recipe("procedural"), 0, None, 0, 2)
+        >>> chunk.arrays["inputs"].shape, chunk.arrays["group"].tolist()
+        ((2, 32, 32, 32), [0, 1])
     """
     layout = ARRAYS | {"frames": OPTIONAL_ARRAYS["frames"]}
     arrays: Arrays = {name: np.empty((stop - start, *shape), dtype) for name, (shape, dtype) in layout.items()}

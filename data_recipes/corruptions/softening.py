@@ -118,6 +118,14 @@ def soften(
 
     Returns:
         ``(R, R, R)`` float32 in [-1, 1].
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> clean = np.zeros((32, 32, 32), dtype=bool)
+        >>> clean[:, :, 10:13] = True  # a slab
+        >>> signed = soften(rng, clean, clean, 0.5)
+        >>> signed.shape, bool(signed.min() >= -1), bool(signed[clean].mean() > signed[~clean].mean())
+        ((32, 32, 32), True, True)
     """
     if clean.shape != corrupted.shape or clean.dtype != np.bool_ or corrupted.dtype != np.bool_:
         raise ValueError(

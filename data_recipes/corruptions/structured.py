@@ -272,6 +272,14 @@ def corrupt(rng: np.random.Generator, occupancy: Occupancy, severity: float) -> 
     Args:
         occupancy: ``(R, R, R)`` bool.
         severity: [0, 1]; 0 is the identity.
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> clean = np.zeros((32, 32, 32), dtype=bool)
+        >>> clean[:, :, 10:13] = True  # a slab
+        >>> corrupted = corrupt(rng, clean, 0.5)
+        >>> bool((corrupt(rng, clean, 0.0) == clean).all()), bool((corrupted != clean).any())
+        (True, True)
     """
     _check(occupancy)
     total = changed_fraction(severity)

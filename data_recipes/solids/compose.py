@@ -207,6 +207,12 @@ def dilate(occupancy: Occupancy, iterations: int, *, faces_only: bool = False) -
         occupancy: ``(R, R, R)`` bool.
         iterations: >= 0.
         faces_only: 6 neighbours rather than 26.
+
+    Example:
+        >>> point = np.zeros((3, 3, 3), dtype=bool)
+        >>> point[1, 1, 1] = True
+        >>> [int(dilate(point, 1, faces_only=faces).sum()) for faces in (False, True)]
+        [27, 7]
     """
     if iterations < 0:
         raise ValueError(f"dilate: iterations must be >= 0, got {iterations}")
@@ -270,6 +276,12 @@ def sample_cube(rng: np.random.Generator, recipe: Recipe) -> tuple[Occupancy, fl
     Returns:
         ``occupancy (32, 32, 32)`` bool, the cube's edge over the object's extent, and where the cube lay in the
         coordinates of its object; None for a cube that is empty by choice, for which no object was composed.
+
+    Example:
+        >>> from unghost.data_recipes.recipe import load_recipe
+        >>> occupancy, edge_fraction, frame = sample_cube(np.random.default_rng(0), load_recipe("procedural"))
+        >>> occupancy.shape, bool(occupancy.any()), 0 < edge_fraction <= 1
+        ((32, 32, 32), True, True)
     """
     fraction = log_uniform(rng, *recipe.edge_fraction)
     if rng.random() < recipe.empty_share:

@@ -151,6 +151,13 @@ def sample_cubes(
     Raises:
         ValueError: a count or a batch below 1, steps outside [1, 1000], an edge fraction that is not > 0, ``eta`` with
             Bernoulli.
+
+    Example:
+        >>> from unghost.prior.diffusion.model import DiffusionConfig
+        >>> from unghost.prior.networks.restoration import SIZES
+        >>> network = DiffusionNet(DiffusionConfig("x0", SIZES["xs"])).eval()
+        >>> sample_cubes(network, count=1, edge_fraction=0.1, seed=0, steps=2).shape
+        torch.Size([1, 1, 32, 32, 32])
     """
     if count < 1 or batch_size < 1:
         raise ValueError(f"sample_cubes: count and batch_size must be >= 1, got {count} and {batch_size}")

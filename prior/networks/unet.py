@@ -44,6 +44,10 @@ class UNetConfig:
         blocks: residual blocks a level in the encoder; the decoder has one more.
         heads: of the attention at the coarsest level.
         groups: of the group norms; divide every width.
+
+    Example:
+        >>> unet_gflop(UNetConfig(base_width=8)) < unet_gflop(UNetConfig())
+        True
     """
 
     kind: str = KIND
@@ -203,7 +207,14 @@ class Stage(nn.ModuleList):
 
 
 class UNet(nn.Module):
-    """See the module's docstring; ``encoder`` yields one skip a stage, ``decoder`` takes them back last first."""
+    """See the module's docstring; ``encoder`` yields one skip a stage, ``decoder`` takes them back last first.
+
+    Example:
+        >>> network = UNet(UNetConfig(base_width=8, multipliers=(1, 2))).eval()
+        >>> with torch.no_grad():
+        ...     network(torch.zeros(1, 1, 32, 32, 32), torch.tensor([30]), torch.tensor([0.1])).shape
+        torch.Size([1, 1, 32, 32, 32])
+    """
 
     def __init__(self, config: UNetConfig) -> None:
         super().__init__()
