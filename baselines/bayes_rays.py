@@ -150,6 +150,12 @@ def color_slopes(weights: Tensor, optical_depth: Tensor, lengths: Tensor, colors
 
     Returns:
         ``(N, S, 3)``.
+
+    Example:
+        >>> depth, lengths = torch.tensor([[0.0]]), torch.tensor([[1.0]])
+        >>> weights = 1 - torch.exp(-depth)
+        >>> color_slopes(weights, depth, lengths, torch.ones(1, 1, 3), 0.5)[0, 0].tolist()  # from grey towards white
+        [0.5, 0.5, 0.5]
     """
     through = torch.exp(-torch.cumsum(optical_depth, dim=1))  # T_{i+1}
     seen = weights[..., None] * colors

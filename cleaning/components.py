@@ -70,7 +70,14 @@ def _join(count: int, edges: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def dilate(mask: Mask) -> Mask:
-    """``mask (X, Y, Z)`` and all its 26-neighbours."""
+    """``mask (X, Y, Z)`` and all its 26-neighbours.
+
+    Example:
+        >>> occupied = np.zeros((3, 3, 3), dtype=bool)
+        >>> occupied[1, 1, 1] = True
+        >>> int(dilate(occupied).sum())
+        27
+    """
     grown = mask.copy()
     for axis in range(3):
         step = grown.copy()

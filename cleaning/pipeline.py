@@ -61,6 +61,10 @@ class CleanSettings:
             instead of raising.
         backend: what the callable takes, ``"numpy"`` or ``"torch"``; None to find out.
         chunk: most positions handed to the callable at once.
+
+    Example:
+        >>> CleanSettings(strength=0.3).strength
+        0.3
     """
 
     field_pitch: float | None = None

@@ -43,6 +43,10 @@ def choose_providers(asked: Sequence[str] | None, available: Sequence[str]) -> l
 
     Raises:
         ValueError: none, or one that ``available`` does not hold.
+
+    Example:
+        >>> choose_providers(None, ["CUDAExecutionProvider", "CPUExecutionProvider"])
+        ['CUDAExecutionProvider', 'CPUExecutionProvider']
     """
     chosen = [name for name in PREFERRED if name in available] if asked is None else list(asked)
     missing = [name for name in chosen if name not in available]

@@ -21,6 +21,10 @@ class FrequencyConfig:
         initial_opacity: opacity of one cell (half the shortest wavelength) before training.
         contract: False for a scene that lies wholly in [-1, 1]^3.
         seed: of the start values.
+
+    Example:
+        >>> FrequencyConfig(resolution=64).octaves
+        6
     """
 
     resolution: int = 128

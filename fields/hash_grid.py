@@ -35,6 +35,10 @@ class HashConfig:
         initial_opacity: opacity of one finest cell before training.
         contract: False for a scene that lies wholly in [-1, 1]^3.
         seed: of the start values.
+
+    Example:
+        >>> HashConfig(resolution=64, base_resolution=16, levels=3).resolutions
+        (16, 32, 64)
     """
 
     resolution: int = 128

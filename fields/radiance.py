@@ -31,6 +31,10 @@ class RadianceConfig:
         color_resolution: colour nodes along an axis.
         initial_opacity: opacity of one cell before training.
         contract: False for a scene that lies wholly in [-1, 1]^3; the grid then covers just that box.
+
+    Example:
+        >>> RadianceField(RadianceConfig(resolution=16, color_resolution=8)).resolution
+        16
     """
 
     resolution: int = 160

@@ -78,8 +78,7 @@ class DensityRegularizer:
         ...     return level * (positions.norm(dim=-1) < 0.5)
         >>> regularizer = DensityRegularizer(load_denoiser(), aabb=[[-1] * 3, [1] * 3], field_pitch=0.05, cubes=2)
         >>> losses = regularizer(density_fn)
-        >>> loss = 0.0 + sum(losses.values())  # photometric + ...
-        >>> loss.backward()
+        >>> sum(losses.values()).backward()  # add them to your photometric loss
         >>> sorted(losses), bool(torch.isfinite(level.grad))
         (['dsds', 'visibility'], True)
     """

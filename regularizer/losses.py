@@ -91,6 +91,10 @@ def visibility_loss(density: Tensor, view_count: Tensor, *, min_views: int = 1) 
 
     Raises:
         ValueError: shapes differ, or ``min_views < 1``.
+
+    Example:
+        >>> visibility_loss(torch.tensor([2.0, 2.0]), torch.tensor([0, 3])).tolist()
+        [2.0, 0.0]
     """
     if view_count.shape != density.shape:
         raise ValueError(

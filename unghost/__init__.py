@@ -1,6 +1,6 @@
 """Take ghosts (floaters, fog, false surfaces) out of radiance fields.
 
->>> from unghost import DensityRegularizer, clean, load_denoiser  # doctest: +SKIP
+>>> from unghost import DensityRegularizer, clean, load_denoiser
 
 Importing this package loads nothing heavy: every name below arrives when it is first used.
 """

@@ -30,7 +30,9 @@ def clean(density_fn: Callable[..., Any], aabb: Any, *, denoiser: Any = None, **
         ValueError: densities that are NaN, infinite, negative or of the wrong shape; an impossible box.
 
     Example:
-        >>> mask = clean(lambda p: (abs(p) < 0.5).all(-1) * 50.0, [[-1, -1, -1], [1, 1, 1]])  # doctest: +SKIP
+        >>> mask = clean(lambda p: (abs(p) < 0.5).all(-1) * 50.0, [[-1, -1, -1], [1, 1, 1]], resolution=16)
+        >>> mask.cells.shape
+        (16, 16, 16)
     """
     return pipeline.clean(density_fn, aabb, denoiser=load_denoiser() if denoiser is None else denoiser, **options)
 

@@ -112,7 +112,13 @@ def space_to_depth(grid: Tensor) -> Tensor:
 
 
 def depth_to_space(grid: Tensor) -> Tensor:
-    """Inverse of :func:`space_to_depth`."""
+    """Inverse of :func:`space_to_depth`.
+
+    Example:
+        >>> cubes = torch.arange(64.0).view(1, 1, 4, 4, 4)
+        >>> bool((depth_to_space(space_to_depth(cubes)) == cubes).all())
+        True
+    """
     count, channels, depth, height, width = grid.shape
     parts = grid.reshape(count, channels // 8, 2, 2, 2, depth, height, width)
     return parts.permute(0, 1, 5, 2, 6, 3, 7, 4).reshape(count, channels // 8, depth * 2, height * 2, width * 2)

@@ -100,11 +100,6 @@ def build_room(seed: int = 0) -> Room:
 
     Raises:
         ValueError: ``seed`` is negative.
-
-    Example:
-        >>> room = build_room(0)
-        >>> room.density.shape == room.ghost_kind.shape, bool((room.density >= room.true_density).all())
-        (True, True)
     """
     if seed < 0:
         raise ValueError(f"build_room: seed must be >= 0, got {seed}")
