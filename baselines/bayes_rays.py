@@ -110,6 +110,16 @@ def deformation_uncertainty(
         seed: which ones.
         sampling: along each ray.
         background: grey level behind everything.
+
+    Example:
+        >>> from unghost.fields.radiance import RadianceConfig, RadianceField
+        >>> cameras = Cameras.create(np.eye(3, 4)[None], np.array([8.0, 8.0, 4.0, 3.0]), 8, 6)
+        >>> field = RadianceField(RadianceConfig(resolution=8, color_resolution=8))
+        >>> _ = torch.nn.init.normal_(field.density_table, generator=torch.Generator().manual_seed(0))
+        >>> found = deformation_uncertainty(field, cameras, np.zeros((1, 6, 8, 3), np.float32), level=3, rays=48)
+        >>> behind, before = found.log_deviation(torch.tensor([[0.0, 0.0, 0.9], [0.0, 0.0, -0.5]])).tolist()
+        >>> behind > before  # nothing is known of what lies behind the camera
+        True
     """
     if level < 1 or rays < 1 or batch < 1:
         raise ValueError(f"deformation_uncertainty: level, rays and batch must be >= 1, got {level}, {rays}, {batch}")
@@ -140,6 +150,12 @@ def color_slopes(weights: Tensor, optical_depth: Tensor, lengths: Tensor, colors
 
     Returns:
         ``(N, S, 3)``.
+
+    Example:
+        >>> depth, lengths = torch.tensor([[0.0]]), torch.tensor([[1.0]])
+        >>> weights = 1 - torch.exp(-depth)
+        >>> color_slopes(weights, depth, lengths, torch.ones(1, 1, 3), 0.5)[0, 0].tolist()  # from grey towards white
+        [0.5, 0.5, 0.5]
     """
     through = torch.exp(-torch.cumsum(optical_depth, dim=1))  # T_{i+1}
     seen = weights[..., None] * colors

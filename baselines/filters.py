@@ -29,7 +29,14 @@ PAD = 2
 
 
 def largest_component(occupied: Bits) -> Bits:
-    """The piece (26 neighbours) with the most voxels."""
+    """The piece (26 neighbours) with the most voxels.
+
+    Example:
+        >>> occupied = np.zeros((16, 16, 16), dtype=bool)
+        >>> occupied[:8, :8, :8] = occupied[14, 14, 14] = True
+        >>> int(occupied.sum()), int(largest_component(occupied).sum())
+        (513, 512)
+    """
     labels, count = ndimage.label(occupied, structure=TOUCHING)
     sizes = np.bincount(labels.ravel(), minlength=count + 1)
     sizes[0] = 0
@@ -37,7 +44,14 @@ def largest_component(occupied: Bits) -> Bits:
 
 
 def large_components(occupied: Bits) -> Bits:
-    """Pieces of ``SMALLEST`` voxels or more."""
+    """Pieces of ``SMALLEST`` voxels or more.
+
+    Example:
+        >>> occupied = np.zeros((16, 16, 16), dtype=bool)
+        >>> occupied[:8, :8, :8] = occupied[14, 14, 14] = True
+        >>> int(occupied.sum()), int(large_components(occupied).sum())
+        (513, 512)
+    """
     labels, count = ndimage.label(occupied, structure=TOUCHING)
     large = np.bincount(labels.ravel(), minlength=count + 1) >= SMALLEST
     large[0] = False
@@ -53,34 +67,77 @@ def _padded(operation: Callable[..., Any], occupied: Bits) -> Bits:
 
 
 def opening(occupied: Bits) -> Bits:
-    """Erosion, then dilation: takes away what is thinner than three voxels."""
+    """Erosion, then dilation: takes away what is thinner than three voxels.
+
+    Example:
+        >>> occupied = np.zeros((16, 16, 16), dtype=bool)
+        >>> occupied[:8, :8, :8] = occupied[14, 14, 14] = True
+        >>> bool(opening(occupied)[14, 14, 14])
+        False
+    """
     return _padded(ndimage.binary_opening, occupied)
 
 
 def closing(occupied: Bits) -> Bits:
-    """Dilation, then erosion: fills gaps of one or two voxels."""
+    """Dilation, then erosion: fills gaps of one or two voxels.
+
+    Example:
+        >>> occupied = np.ones((16, 16, 16), dtype=bool)
+        >>> occupied[8, 8, 8] = False
+        >>> bool(closing(occupied).all())
+        True
+    """
     return _padded(ndimage.binary_closing, occupied) | occupied
 
 
 def components_and_closing(occupied: Bits) -> Bits:
-    """Small pieces removed, then a closing."""
+    """Small pieces removed, then a closing.
+
+    Example:
+        >>> occupied = np.zeros((16, 16, 16), dtype=bool)
+        >>> occupied[:8, :8, :8] = occupied[14, 14, 14] = True
+        >>> occupied[4, 4, 4] = False
+        >>> components_and_closing(occupied)[[4, 14], [4, 14], [4, 14]].tolist()
+        [True, False]
+    """
     return closing(large_components(occupied))
 
 
 def gaussian(values: Values) -> Values:
-    """Standard deviation of one voxel."""
+    """Standard deviation of one voxel.
+
+    Example:
+        >>> values = np.zeros((5, 5, 5), np.float32)
+        >>> values[2, 2, 2] = 1.0
+        >>> round(float(gaussian(values)[2, 2, 2]), 4)
+        0.0635
+    """
     smoothed: Values = ndimage.gaussian_filter(values, 1.0, mode="nearest")
     return smoothed
 
 
 def median(values: Values) -> Values:
-    """Over 3 x 3 x 3 voxels."""
+    """Over 3 x 3 x 3 voxels.
+
+    Example:
+        >>> values = np.zeros((5, 5, 5), np.float32)
+        >>> values[2, 2, 2] = 1.0
+        >>> float(median(values).max())
+        0.0
+    """
     middle: Values = ndimage.median_filter(values, 3, mode="nearest")
     return middle
 
 
 def total_variation(values: Values) -> Values:
-    """Chambolle's, at a weight of .6 (not tuned)."""
+    """Chambolle's, at a weight of .6 (not tuned).
+
+    Example:
+        >>> values = np.zeros((5, 5, 5), np.float32)
+        >>> values[2, 2, 2] = 1.0
+        >>> bool(total_variation(values).max() < 1)
+        True
+    """
     from skimage.restoration import denoise_tv_chambolle
 
     result: Values = denoise_tv_chambolle(  # type: ignore[no-untyped-call]
@@ -100,14 +157,27 @@ OF_VALUES: dict[str, Callable[[Values], Values]] = {"gaussian": gaussian, "media
 
 
 def decided(signed: Values) -> Values:
-    """Signed opacity so bent that the opacity which counts as opaque is at 0; increasing, [-1, 1] onto itself."""
+    """Signed opacity so bent that the opacity which counts as opaque is at 0; increasing, [-1, 1] onto itself.
+
+    Example:
+        >>> decided(np.array([-1.0, -0.8, 1.0], np.float32)).tolist()  # an opacity of 0.1 is at 0
+        [-1.0, 0.0, 1.0]
+    """
     zero = float(signed_from_opacity(np.float32(DEFAULT_OPACITY_THRESHOLD)))
     bent: Values = np.interp(signed, [-1.0, zero, 1.0], [-1.0, 0.0, 1.0]).astype(np.float32)
     return bent
 
 
 class Classical:
-    """A filter as a denoiser of one channel; ``input`` changes nothing."""
+    """A filter as a denoiser of one channel; ``input`` changes nothing.
+
+    Example:
+        >>> cubes = np.full((1, 1, 32, 32, 32), -1.0, np.float32)
+        >>> cubes[0, 0, :8, :8, :8] = cubes[0, 0, 30, 30, 30] = 1.0
+        >>> cleaned = Classical("largest component")(cubes, 0, 0.1)
+        >>> int((cubes > 0).sum()), int((cleaned > 0).sum())
+        (513, 512)
+    """
 
     kind = "numpy"
 

@@ -35,6 +35,12 @@ def total_variation_loss(grid: Tensor) -> Tensor:
 
     Raises:
         ValueError: fewer than three axes, or one shorter than 2.
+
+    Example:
+        >>> grid = torch.zeros(2, 2, 2)
+        >>> grid[1] = 3.0
+        >>> total_variation_loss(grid).flatten().tolist()
+        [3.0]
     """
     if grid.ndim < 3 or min(grid.shape[-3:]) < 2:
         raise ValueError(f"total_variation_loss: grid must be (..., X, Y, Z) with sides >= 2, got {tuple(grid.shape)}")
@@ -55,6 +61,10 @@ def sparsity_loss(density: Tensor, *, length: float) -> Tensor:
     Args:
         density: ``(...)`` >= 0, per scene unit.
         length: ``lambda``, scene units, > 0.
+
+    Example:
+        >>> [round(value, 3) for value in sparsity_loss(torch.tensor([0.0, 1.0, 1e6]), length=1.0).tolist()]
+        [0.0, 0.632, 1.0]
     """
     if not (math.isfinite(length) and length > 0):
         raise ValueError(f"sparsity_loss: length must be finite and > 0, got {length}")
@@ -70,6 +80,10 @@ def depth_smoothness_loss(depth: Tensor) -> Tensor:
 
     Returns:
         ``(..., H - 1, W - 1)`` float64 (float32 on mps): down plus across. Finite for depths up to 1e153 (1e18).
+
+    Example:
+        >>> depth_smoothness_loss(torch.tensor([[1.0, 1.0], [3.0, 1.0]])).tolist()
+        [[4.0]]
     """
     if depth.ndim < 2 or min(depth.shape[-2:]) < 2:
         raise ValueError(f"depth_smoothness_loss: depth must be (..., H, W), sides >= 2, got {tuple(depth.shape)}")
@@ -92,6 +106,11 @@ def distortion_loss(weights: Tensor, edges: Tensor) -> Tensor:
 
     Raises:
         ValueError: shapes that do not fit; an edge that is infinite or NaN.
+
+    Example:
+        >>> edges = torch.tensor([0.0, 0.5, 1.0])
+        >>> [round(float(distortion_loss(torch.tensor(weights), edges)), 4) for weights in ([1.0, 0.0], [0.5, 0.5])]
+        [0.1667, 0.3333]
     """
     finite = torch.isfinite(edges)
     if not bool(finite.all()):
@@ -108,6 +127,10 @@ def free_space_loss(density: Tensor) -> Tensor:
 
     Args:
         density: ``(...)`` >= 0, per scene unit: the least value is 1/2.
+
+    Example:
+        >>> [round(value, 3) for value in free_space_loss(torch.tensor([0.0, 4.0])).tolist()]
+        [0.5, 0.982]
     """
     return torch.sigmoid(upcast(density))
 
@@ -139,6 +162,12 @@ def scale_gradients(values: Tensor, distance: Tensor) -> Tensor:
 
     Raises:
         ValueError: shapes that do not fit; distances that are NaN or negative.
+
+    Example:
+        >>> density = torch.ones(3, requires_grad=True)
+        >>> scale_gradients(density, torch.tensor([0.0, 0.5, 2.0])).sum().backward()
+        >>> density.grad.tolist()
+        [0.0, 0.25, 1.0]
     """
     if values.shape[: distance.ndim] != distance.shape:
         raise ValueError(
@@ -168,6 +197,10 @@ def squash_density(density: Tensor, *, threshold: float, how: Squash) -> Tensor:
         density: ``(...)`` >= 0.
         threshold: ``t`` > 0, where density begins to be occupied.
         how: see above.
+
+    Example:
+        >>> squash_density(torch.tensor([0.0, 0.01, 0.02, 5.0]), threshold=0.01, how="clamp").tolist()
+        [-1.0, 0.0, 1.0, 1.0]
     """
     if not (math.isfinite(threshold) and threshold > 0):
         raise ValueError(f"squash_density: threshold must be finite and > 0, got {threshold}")
@@ -191,6 +224,12 @@ def sds_loss(signed: Tensor, x0_pred: Tensor, *, alpha_cumprod: float | Tensor) 
         signed: ``(N, ...)``, :func:`squash_density` of the cubes; differentiated.
         x0_pred: the same shape: what the denoiser made of ``sqrt(a) signed + sqrt(1 - a) noise``; not differentiated.
         alpha_cumprod: ``a`` in (0, 1) at the timestep; a number, or one for each cube ``(N,)``.
+
+    Example:
+        >>> signed = torch.tensor([[0.5]], requires_grad=True)
+        >>> sds_loss(signed, torch.tensor([[-1.0]]), alpha_cumprod=0.36).sum().backward()
+        >>> round(signed.grad.item(), 2)  # (1 - a) sqrt(a / (1 - a)) (0.5 + 1)
+        0.72
     """
     if x0_pred.shape != signed.shape:
         raise ValueError(f"sds_loss: x0_pred must have shape {tuple(signed.shape)}, got {tuple(x0_pred.shape)}")

@@ -38,6 +38,13 @@ def label_components(occupied: Mask, *, connectivity: int = 26) -> tuple[NDArray
 
     Raises:
         ValueError: another connectivity.
+
+    Example:
+        >>> occupied = np.zeros((4, 4, 4), dtype=bool)
+        >>> occupied[0, 0, :2] = occupied[3, 3, 3] = True
+        >>> labels, count = label_components(occupied)
+        >>> count, labels[0, 0].tolist()
+        (2, [1, 1, 0, 0])
     """
     if connectivity not in (6, 26):
         raise ValueError(f"label_components: connectivity must be 6 or 26, got {connectivity}")
@@ -86,7 +93,14 @@ def _join(count: int, edges: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def dilate(mask: Mask) -> Mask:
-    """``mask (X, Y, Z)`` and all its 26-neighbours."""
+    """``mask (X, Y, Z)`` and all its 26-neighbours.
+
+    Example:
+        >>> occupied = np.zeros((3, 3, 3), dtype=bool)
+        >>> occupied[1, 1, 1] = True
+        >>> int(dilate(occupied).sum())
+        27
+    """
     grown = mask.copy()
     for axis in range(3):
         step = grown.copy()

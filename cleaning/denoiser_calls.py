@@ -15,7 +15,13 @@ BATCH = 40  # cubes handed to a denoiser at once
 
 
 def check_denoiser(denoiser: Denoiser, *, caller: str) -> Denoiser:
-    """Refuse what is no denoiser."""
+    """Refuse what is no denoiser.
+
+    Example:
+        >>> from unghost.baselines.filters import Classical
+        >>> check_denoiser(Classical("input"), caller="clean").manifest.channels
+        ('signed_opacity',)
+    """
     if not callable(denoiser) or not hasattr(denoiser, "manifest"):
         raise TypeError(f"{caller}: denoiser must be callable and have a manifest, got {type(denoiser).__name__}")
     if getattr(denoiser, "kind", None) not in ("numpy", "torch"):
@@ -40,6 +46,13 @@ def run_denoiser(
 
     Raises:
         ValueError: a prediction of another shape, or one that is not finite.
+
+    Example:
+        >>> import numpy as np
+        >>> from unghost.baselines.filters import Classical
+        >>> channels = np.full((2, 1, 32, 32, 32), -1.0, np.float32)
+        >>> run_denoiser(Classical("input"), channels, 300, np.full(2, 0.1), caller="example").shape
+        (2, 1, 32, 32, 32)
     """
     if len(channels) == 0:
         return channels[:, :1]

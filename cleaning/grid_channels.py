@@ -35,7 +35,15 @@ STRIDE = 3
 
 
 def viewing_cameras(cameras: Cameras | None, names: Sequence[str]) -> Cameras | None:
-    """The cameras to count views with (their borders straightened), or None if nobody asks or there are none."""
+    """The cameras to count views with (their borders straightened), or None if nobody asks or there are none.
+
+    Example:
+        >>> cameras = Cameras.create(np.eye(3, 4)[None], np.array([8.0, 8.0, 4.0, 3.0]), 8, 6)
+        >>> viewing_cameras(cameras, ("signed_opacity",)) is None
+        True
+        >>> len(viewing_cameras(cameras, ("signed_opacity", "view_count")))
+        1
+    """
     if cameras is None or len(cameras) == 0 or VIEW_COUNT not in names:
         return None
     return pinholes(cameras)
@@ -44,7 +52,14 @@ def viewing_cameras(cameras: Cameras | None, names: Sequence[str]) -> Cameras | 
 def view_channel(
     cameras: Cameras, centers: FloatArray, edges: FloatArray, rotations: FloatArray | None = None
 ) -> FloatGrid:
-    """The channel ``view_count`` of cubes ``(N, 3)``, ``(N,)``, ``(N, 3, 3)`` or axis-aligned: ``(N, 32, 32, 32)``."""
+    """The channel ``view_count`` of cubes ``(N, 3)``, ``(N,)``, ``(N, 3, 3)`` or axis-aligned: ``(N, 32, 32, 32)``.
+
+    Example:
+        >>> cameras = Cameras.create(np.eye(3, 4)[None], np.array([8.0, 8.0, 4.0, 3.0]), 8, 6)
+        >>> counts = view_channel(cameras, np.array([[0.0, 0.0, -3.0], [0.0, 0.0, 3.0]]), np.full(2, 0.5))
+        >>> counts.shape, counts.max(axis=(1, 2, 3)).tolist()  # in view, behind the camera
+        ((2, 32, 32, 32), [-0.3125, -0.5])
+    """
     turned = np.broadcast_to(np.eye(3), (len(centers), 3, 3)) if rotations is None else rotations
     return encode_view_count(count_views(cameras, centers, edges, turned))
 
@@ -60,6 +75,14 @@ def light_maps(
         density_fn: ``(M, 3)`` to ``(M,)``, asked inside the box alone; what is NaN, infinite or negative lets light by.
         aabb: ``(2, 3)``.
         pitch: side of the field's cells.
+
+    Example:
+        >>> cameras = Cameras.create(np.eye(3, 4)[None], np.array([8.0, 8.0, 4.0, 3.0]), 8, 6)
+        >>> aabb = np.array([[-1.0, -1.0, -4.0], [1.0, 1.0, -2.0]])
+        >>> names = ("signed_opacity", "transmittance")
+        >>> maps = light_maps(names, cameras, lambda p: np.ones(len(p)), aabb=aabb, pitch=0.1)
+        >>> maps.through.shape
+        (1, 6, 8, 97)
     """
     if cameras is None or len(cameras) == 0 or TRANSMITTANCE not in names:
         return None
@@ -78,7 +101,16 @@ def light_channel(
     maps: TransmittanceMaps, centers: FloatArray, edges: FloatArray, rotations: FloatArray | None = None
 ) -> FloatGrid:
     """The channel ``transmittance`` of cubes ``(N, 3)``, ``(N,)``, ``(N, 3, 3)`` or axis-aligned:
-    ``(N, 16, 16, 16)``."""
+    ``(N, 16, 16, 16)``.
+
+    Example:
+        >>> cameras = Cameras.create(np.eye(3, 4)[None], np.array([8.0, 8.0, 4.0, 3.0]), 8, 6)
+        >>> aabb = np.array([[-1.0, -1.0, -4.0], [1.0, 1.0, -2.0]])
+        >>> maps = light_maps(("transmittance",), cameras, lambda p: np.ones(len(p)), aabb=aabb, pitch=0.1)
+        >>> light = light_channel(maps, np.array([[0.0, 0.0, -3.0]]), np.full(1, 0.5))
+        >>> light.shape
+        (1, 16, 16, 16)
+    """
     lattice = cube_lattices(centers, edges, rotations, resolution=TRANSMITTANCE_RESOLUTION)
     return encode_share(maps.best_view(lattice))
 

@@ -34,6 +34,13 @@ class KeepMask:
         details: JSON-able: ``occupied``, ``removed``, ``faint_removed`` and ``dropped`` cells, positions ``asked``,
             ``windows`` sent, ``regions`` removed (largest first: ``voxels, volume, box, confidence``),
             ``region_count``, ``settings``.
+
+    Example:
+        >>> cells = np.ones((2, 2, 2), dtype=bool)
+        >>> cells[0, 0, 0] = False
+        >>> mask = KeepMask(np.array([[0.0, 0.0, 0.0], [2.0, 2.0, 2.0]]), 1.0, cells)
+        >>> mask.keep(np.array([[0.5, 0.5, 0.5], [1.5, 0.5, 0.5], [9.0, 0.0, 0.0]])).tolist()  # the last lies outside
+        [False, True, True]
     """
 
     aabb: NDArray[np.float64]

@@ -61,6 +61,10 @@ class CleanSettings:
             instead of raising.
         backend: what the callable takes, ``"numpy"`` or ``"torch"``; None to find out.
         chunk: most positions handed to the callable at once.
+
+    Example:
+        >>> CleanSettings(strength=0.3).strength
+        0.3
     """
 
     field_pitch: float | None = None
@@ -146,8 +150,15 @@ def clean(
             shape, or NaN, infinite or negative values.
 
     Example:
-        >>> mask = clean(density_fn, aabb, denoiser=denoiser, field_pitch=0.02)  # doctest: +SKIP
-        >>> cleaned_fn = mask.apply(density_fn)  # doctest: +SKIP
+        >>> from unghost import load_denoiser
+        >>> denoiser = load_denoiser("default", backend="onnx")
+        >>> def density_fn(p):  # a floor, and a floater above it
+        ...     floor, floater = abs(p[:, 2] + 0.5) < 0.15, np.linalg.norm(p - 0.4, axis=1) < 0.2
+        ...     return 50.0 * (floor | floater)
+        >>> mask = clean(density_fn, [[-1, -1, -1], [1, 1, 1]], denoiser=denoiser, resolution=32)
+        >>> mask.summary()["removed"] > 0, mask.keep(np.array([[0.0, 0.0, -0.5]])).tolist()
+        (True, [True])
+        >>> cleaned_fn = mask.apply(density_fn)
     """
     return judge(
         density_fn, aabb, denoiser=denoiser, cameras=cameras, settings=settings, progress=progress, **overrides
@@ -164,6 +175,16 @@ class Judgement:
         score: ``(X, Y, Z)`` in [-1, 1], the mean prediction for each cell.
         settings: see :class:`CleanSettings`.
         advised: the denoiser's own threshold.
+
+    Example:
+        >>> from unghost.baselines.filters import Classical
+        >>> def density_fn(p):  # a floor, and a floater above it
+        ...     floor, floater = abs(p[:, 2] + 0.5) < 0.15, np.linalg.norm(p - 0.4, axis=1) < 0.2
+        ...     return 50.0 * (floor | floater)
+        >>> box, denoiser = [[-1, -1, -1], [1, 1, 1]], Classical("largest component")
+        >>> judgement = judge(density_fn, box, denoiser=denoiser, resolution=32)
+        >>> [judgement.mask(strength).summary()["removed"] > 0 for strength in (0.1, 0.9)]
+        [False, True]
     """
 
     aabb: NDArray[np.float64]
@@ -238,7 +259,18 @@ def judge(
     progress: Progress | None = None,
     **overrides: Any,
 ) -> Judgement:
-    """The costly part of :func:`clean`, with its arguments: survey the field, score its cells."""
+    """The costly part of :func:`clean`, with its arguments: survey the field, score its cells.
+
+    Example:
+        >>> from unghost.baselines.filters import Classical
+        >>> def density_fn(p):  # a floor, and a floater above it
+        ...     floor, floater = abs(p[:, 2] + 0.5) < 0.15, np.linalg.norm(p - 0.4, axis=1) < 0.2
+        ...     return 50.0 * (floor | floater)
+        >>> box, denoiser = [[-1, -1, -1], [1, 1, 1]], Classical("largest component")
+        >>> judgement = judge(density_fn, box, denoiser=denoiser, resolution=32)
+        >>> judgement.score.shape
+        (32, 32, 32)
+    """
     known = {item.name for item in dataclasses.fields(CleanSettings)}
     if set(overrides) - known:
         raise TypeError(f"clean: unknown settings {sorted(set(overrides) - known)}; known are {sorted(known)}")

@@ -48,6 +48,14 @@ def decide(
 
     Returns:
         removed occupied cells, removed faint cells, both ``(X, Y, Z)`` bool.
+
+    Example:
+        >>> occupied, score = np.zeros((8, 8, 8), dtype=bool), np.ones((8, 8, 8), np.float32)
+        >>> occupied[:, :, 0] = occupied[5:7, 5:7, 5:7] = True  # a floor and a floater
+        >>> score[5:7, 5:7, 5:7] = -1.0
+        >>> removed, faint = decide(occupied, occupied, score, threshold=0.0, smallest=8, speck=4)
+        >>> int(removed.sum()), int(faint.sum())
+        (8, 0)
     """
     voted = occupied & (score < threshold)
     labels, count = label_components(occupied)

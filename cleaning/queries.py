@@ -19,7 +19,12 @@ CHUNK = 1 << 18
 
 
 def field_device(density_fn: Any) -> Any:
-    """Device of the first parameter of the torch module behind a callable (itself, or a method's owner), or None."""
+    """Device of the first parameter of the torch module behind a callable (itself, or a method's owner), or None.
+
+    Example:
+        >>> print(field_device(lambda positions: positions))
+        None
+    """
     owner = getattr(density_fn, "__self__", density_fn)
     torch = sys.modules.get("torch")
     if torch is None or not isinstance(owner, torch.nn.Module):
@@ -94,6 +99,11 @@ def make_query(
     Raises:
         TypeError: from the query, what came back is no array or tensor of integers or floating-point numbers.
         ValueError: from the query, it is of another shape.
+
+    Example:
+        >>> query = make_query(lambda p: p[:, :1] + 1.0, place=np.zeros(3), caller="example")
+        >>> query(np.array([[2.0, 0.0, 0.0]])).tolist()
+        [3.0]
     """
     if backend not in (None, "numpy", "torch"):
         raise ValueError(f"{caller}: backend must be None, 'numpy' or 'torch', got {backend!r}")

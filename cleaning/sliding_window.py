@@ -22,19 +22,37 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 
 
 def window_weight(resolution: int) -> FloatGrid:
-    """``(R, R, R)`` weight of a window's voxels: a raised cosine, heaviest in the middle, nowhere zero."""
+    """``(R, R, R)`` weight of a window's voxels: a raised cosine, heaviest in the middle, nowhere zero.
+
+    Example:
+        >>> weight = window_weight(4)
+        >>> weight.shape, bool(weight[1, 1, 1] > weight[0, 0, 0] > 0)
+        ((4, 4, 4), True)
+    """
     axis = np.sin(np.pi * (np.arange(resolution) + 0.5) / resolution) ** 2 + 0.05
     return (axis[:, None, None] * axis[:, None] * axis).astype(np.float32)
 
 
 def window_starts(length: int, resolution: int, stride: int) -> NDArray[np.int64]:
-    """First indices of windows along an axis of ``length`` cells; they reach out, so that all are covered alike."""
+    """First indices of windows along an axis of ``length`` cells; they reach out, so that all are covered alike.
+
+    Example:
+        >>> window_starts(64, 32, 16).tolist()
+        [-16, 0, 16, 32, 48]
+    """
     last = -(-(length + resolution - 2 * stride) // stride)
     return np.arange(max(last, 0) + 1) * stride - (resolution - stride)
 
 
 def shrink(signed: FloatGrid, factor: int) -> FloatGrid:
-    """Largest value of each block of ``factor^3`` cells; what sticks out is padded with empty."""
+    """Largest value of each block of ``factor^3`` cells; what sticks out is padded with empty.
+
+    Example:
+        >>> signed = np.full((4, 4, 4), -1.0, np.float32)
+        >>> signed[0, 0, 0] = 1.0
+        >>> shrink(signed, 2)[0, 0].tolist()
+        [1.0, -1.0]
+    """
     if factor == 1:
         return signed
     pad = [(0, -length % factor) for length in signed.shape]
@@ -45,7 +63,12 @@ def shrink(signed: FloatGrid, factor: int) -> FloatGrid:
 
 
 def grow(values: NDArray[Scalar], factor: int, shape: tuple[int, ...]) -> NDArray[Scalar]:
-    """Repeat each cell ``factor`` times along each axis and cut to ``shape``."""
+    """Repeat each cell ``factor`` times along each axis and cut to ``shape``.
+
+    Example:
+        >>> grow(np.array([[[1, 2]]]), 2, (1, 1, 3)).tolist()
+        [[[1, 1, 2]]]
+    """
     for axis in range(3):
         values = np.repeat(values, factor, axis=axis)
     return values[: shape[0], : shape[1], : shape[2]]

@@ -51,7 +51,15 @@ def keep_scores(gaussians: Gaussians, mask: KeepMask) -> NDArray[np.float32]:
 
 
 def box_of(gaussians: Gaussians, *, reach: float = REACH) -> NDArray[np.float64]:
-    """Where to clean ``(2, 3)``: ``reach`` times the box that holds 98 % of the opacity, and no more than there is."""
+    """Where to clean ``(2, 3)``: ``reach`` times the box that holds 98 % of the opacity, and no more than there is.
+
+    Example:
+        >>> means = np.random.default_rng(0).uniform(-1, 1, (200, 3)) * [1, 1, 0.02]
+        >>> quaternions = np.tile([1.0, 0.0, 0.0, 0.0], (200, 1))
+        >>> gaussians = Gaussians.create(means, np.full((200, 3), 0.1), quaternions, np.full(200, 4.0))
+        >>> box_of(gaussians).shape
+        (2, 3)
+    """
     core, everything = gaussians.aabb(share=SHARE), gaussians.aabb(share=1.0)
     middle, half = core.mean(axis=0), (core[1] - core[0]) / 2
     box: NDArray[np.float64] = np.clip(middle + reach * np.array([-1.0, 1.0])[:, None] * half, *everything)
@@ -59,7 +67,15 @@ def box_of(gaussians: Gaussians, *, reach: float = REACH) -> NDArray[np.float64]
 
 
 def pitch_of(gaussians: Gaussians, aabb: NDArray[np.float64], resolution: int | None) -> float:
-    """Side of a cell: by the resolution, or of a typical splat's own size (the median, opaque ones counting more)."""
+    """Side of a cell: by the resolution, or of a typical splat's own size (the median, opaque ones counting more).
+
+    Example:
+        >>> means = np.random.default_rng(0).uniform(-1, 1, (200, 3)) * [1, 1, 0.02]
+        >>> quaternions = np.tile([1.0, 0.0, 0.0, 0.0], (200, 1))
+        >>> gaussians = Gaussians.create(means, np.full((200, 3), 0.1), quaternions, np.full(200, 4.0))
+        >>> round(pitch_of(gaussians, np.array([[-1.0] * 3, [1.0] * 3]), 50), 3)
+        0.04
+    """
     longest = float((aabb[1] - aabb[0]).max())
     if resolution is not None:
         return longest / resolution
@@ -88,6 +104,15 @@ def clean_splats(
         reach: of :func:`box_of`, >= 1; what is beyond stays.
         mask: of an earlier cleaning, to repeat it; None to judge.
         **options: of :func:`unghost.cleaning.clean`: ``strength``, ``keep_boxes``, ``cameras``, ``progress``, …
+
+    Example:
+        >>> from unghost.baselines.filters import Classical
+        >>> means = np.random.default_rng(0).uniform(-1, 1, (200, 3)) * [1, 1, 0.02]
+        >>> quaternions = np.tile([1.0, 0.0, 0.0, 0.0], (200, 1))
+        >>> gaussians = Gaussians.create(means, np.full((200, 3), 0.1), quaternions, np.full(200, 4.0))
+        >>> cleaned = clean_splats(gaussians, denoiser=Classical("input"), resolution=32)
+        >>> cleaned.keep.shape, bool(cleaned.keep.all())
+        ((200,), True)
     """
     if resolution is not None and resolution < 8:
         raise ValueError(f"clean_splats: resolution must be >= 8, got {resolution}")

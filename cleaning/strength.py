@@ -45,8 +45,14 @@ def choose_strength(
         ValueError: no strengths, one outside [0, 1], an error that is negative or not finite.
 
     Example:
-        >>> choice = choose_strength(judge(density_fn, aabb, denoiser=denoiser), error)  # doctest: +SKIP
-        >>> cleaned_fn = choice.mask.apply(density_fn)  # doctest: +SKIP
+        >>> from unghost.baselines.filters import Classical
+        >>> from unghost.cleaning.pipeline import judge
+        >>> def density_fn(p):
+        ...     return 50.0 * (abs(p[:, 2] + 0.5) < 0.15)
+        >>> judgement = judge(density_fn, [[-1, -1, -1], [1, 1, 1]], denoiser=Classical("input"), resolution=16)
+        >>> choice = choose_strength(judgement, lambda mask: 1.0 + mask.summary()["removed"])  # stands for renders
+        >>> choice.strength
+        0.8
     """
     tried = sorted(set(map(float, strengths)))
     if not tried or not all(0.0 <= strength <= 1.0 for strength in tried):

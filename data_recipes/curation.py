@@ -147,8 +147,12 @@ def curate(
             ``BlockingIOError``: another run is at work in ``out``.
 
     Example:
+        >>> import tempfile
         >>> from unghost.data_recipes.recipe import load_recipe
-        >>> shards = curate(load_recipe("procedural"), "pairs", count=20000, seed=0, workers=2)  # doctest: +SKIP
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     (shard,) = curate(load_recipe("procedural"), folder, count=2, seed=0)
+        ...     print(shard.name, len(read_shard(shard)))
+        shard-00000 2
     """
     _check_numbers(count=(count, 1), seed=(seed, 0), workers=(workers, 1), shard_length=(shard_length, 1))
     opened, root = open_engine(engine, workers), checked_root(recipe, mesh_root)

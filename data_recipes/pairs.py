@@ -88,6 +88,14 @@ def damage(
     Returns:
         input ``(R, R, R)`` float32 signed opacity, labels ``(R, R, R)`` uint8 (0 free, 1 surface, 2 ignore),
         severity in [0, 1].
+
+    Example:
+        >>> from unghost.data_recipes.recipe import load_recipe
+        >>> clean = np.zeros((32, 32, 32), dtype=bool)
+        >>> clean[:, :, 10:13] = True
+        >>> signed, labels, severity = damage(np.random.default_rng(0), clean, load_recipe("procedural"))
+        >>> bool((labels[clean] == SURFACE_LABEL).all())
+        True
     """
     if rng.random() < recipe.clean_share:
         return signed_from_occupancy(clean), _labels(clean), 0.0
@@ -114,6 +122,12 @@ def sample_pair(
     Returns:
         input ``(32, 32, 32)`` float32 signed opacity, labels ``(32, 32, 32)`` uint8 (see :func:`damage`), severity
         in [0, 1], edge fraction, group (the sample's own index, its mesh's row in the manifest, or its tree's number).
+
+    Example:
+        >>> from unghost.data_recipes.recipe import load_recipe
+        >>> signed, labels, severity, edge_fraction, group = sample_pair(load_recipe("procedural"), 5, seed=0)
+        >>> signed.shape, labels.shape, 0 <= severity <= 1, group
+        ((32, 32, 32), (32, 32, 32), True, 5)
     """
     (clean,), _ = _clean_cubes(recipe, [index], seed, checked_root(recipe, mesh_root))
     signed, labels, severity = damage(clean.rng, clean.occupancy, recipe)
@@ -125,6 +139,11 @@ def checked_root(recipe: Recipe, mesh_root: str | Path | None) -> str | None:
 
     Raises:
         ValueError: one is needed and None was given.
+
+    Example:
+        >>> from unghost.data_recipes.recipe import load_recipe
+        >>> checked_root(load_recipe("procedural"), None) is None
+        True
     """
     if recipe.source != "meshes":
         return None
@@ -162,6 +181,12 @@ def make_chunk(recipe: Recipe, seed: int, mesh_root: str | None, start: int, sto
     Raises:
         SampleError: one of them could not be made.
         ImportError: a missing extra.
+
+    Example:
+        >>> from unghost.data_recipes.recipe import load_recipe
+        >>> chunk = make_chunk(load_recipe("procedural"), 0, None, 0, 2)
+        >>> chunk.arrays["inputs"].shape, chunk.arrays["group"].tolist()
+        ((2, 32, 32, 32), [0, 1])
     """
     layout = ARRAYS | {"frames": OPTIONAL_ARRAYS["frames"]}
     arrays: Arrays = {name: np.empty((stop - start, *shape), dtype) for name, (shape, dtype) in layout.items()}

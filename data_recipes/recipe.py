@@ -69,6 +69,10 @@ class Recipe:
             the same way, doubles dropped. Needs pymeshlab.
         remesh_edge: with ``repair``, they are also remeshed to edges of this length, their longest side being 1; 0
             keeps their triangles.
+
+    Example:
+        >>> Recipe.__name__
+        'Recipe'
     """
 
     name: str = "procedural"
@@ -162,6 +166,10 @@ def recipe_from_mapping(values: Mapping[str, Any]) -> Recipe:
 
     Raises:
         ValueError: a key no recipe has (the known ones are listed), or a value of the wrong type.
+
+    Example:
+        >>> recipe_from_mapping({"name": "mine", "soft_share": 0.0}).soft_share
+        0.0
     """
     defaults = {field.name: field.default for field in fields(Recipe)}
     unknown = sorted(set(values) - set(defaults))
@@ -180,7 +188,12 @@ def recipe_from_mapping(values: Mapping[str, Any]) -> Recipe:
 
 
 def builtin_recipes() -> list[str]:
-    """Names of the recipes that come with the package."""
+    """Names of the recipes that come with the package.
+
+    Example:
+        >>> sorted(builtin_recipes())
+        ['csg', 'meshes', 'procedural', 'rooms']
+    """
     return sorted(path.stem for path in BUILTIN_FOLDER.glob("*.toml"))
 
 
@@ -190,6 +203,11 @@ def load_recipe(path_or_name: str | Path) -> Recipe:
     Raises:
         FileNotFoundError: neither a file nor a built-in name.
         ValueError: not TOML, or not a valid recipe.
+
+    Example:
+        >>> recipe = load_recipe("procedural")
+        >>> recipe.name, recipe.soft_share > 0
+        ('procedural', True)
     """
     path = Path(path_or_name)
     if str(path_or_name) in builtin_recipes():

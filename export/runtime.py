@@ -20,7 +20,13 @@ CHUNK = 64  # cubes in one call of onnxruntime; bounds the memory of large batch
 
 
 def read_manifest(path: str | Path) -> Manifest:
-    """The manifest of an ONNX file, after checking the whole file against it."""
+    """The manifest of an ONNX file, after checking the whole file against it.
+
+    Example:
+        >>> import unghost
+        >>> read_manifest(Path(unghost.__file__).parent / "weights" / "default.onnx").channels
+        ('signed_opacity',)
+    """
     return unseal(read_file(path), origin=str(path))
 
 
@@ -37,6 +43,10 @@ def choose_providers(asked: Sequence[str] | None, available: Sequence[str]) -> l
 
     Raises:
         ValueError: none, or one that ``available`` does not hold.
+
+    Example:
+        >>> choose_providers(None, ["CUDAExecutionProvider", "CPUExecutionProvider"])
+        ['CUDAExecutionProvider', 'CPUExecutionProvider']
     """
     chosen = [name for name in PREFERRED if name in available] if asked is None else list(asked)
     missing = [name for name in chosen if name not in available]
@@ -77,8 +87,12 @@ class OnnxDenoiser:
     """``(channels, timestep, edge_fraction) -> x0_pred`` on numpy arrays.
 
     Example:
-        >>> denoiser = OnnxDenoiser("prior.onnx", threads=2)          # doctest: +SKIP
-        >>> x0_pred = denoiser(channels, denoiser.manifest.default_timestep, 0.05)      # doctest: +SKIP
+        >>> import unghost
+        >>> path = Path(unghost.__file__).parent / "weights" / "default.onnx"
+        >>> denoiser = OnnxDenoiser(path, threads=1)
+        >>> cubes = np.full((2, 1, 32, 32, 32), -1.0, np.float32)
+        >>> denoiser(cubes, denoiser.manifest.default_timestep, 0.05).shape
+        (2, 1, 32, 32, 32)
     """
 
     kind = "numpy"

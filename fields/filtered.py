@@ -17,6 +17,14 @@ class FilteredField:
     Args:
         field: what is filtered; shared, not copied.
         keep: ``positions (M, 3) -> (M,)`` bool, as :meth:`unghost.cleaning.keep_mask.KeepMask.keep` is.
+
+    Example:
+        >>> import torch
+        >>> from unghost.fields.radiance import RadianceConfig, RadianceField
+        >>> field = RadianceField(RadianceConfig(resolution=8, color_resolution=8))
+        >>> upper = FilteredField(field, lambda positions: positions[:, 2] > 0)
+        >>> (upper.density_fn(torch.tensor([[0.0, 0.0, 0.5], [0.0, 0.0, -0.5]])) > 0).flatten().tolist()
+        [True, False]
     """
 
     def __init__(self, field: TrainableField, keep: Callable[[Tensor], Tensor]) -> None:

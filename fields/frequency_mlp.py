@@ -21,6 +21,10 @@ class FrequencyConfig:
         initial_opacity: opacity of one cell (half the shortest wavelength) before training.
         contract: False for a scene that lies wholly in [-1, 1]^3.
         seed: of the start values.
+
+    Example:
+        >>> FrequencyConfig(resolution=64).octaves
+        6
     """
 
     resolution: int = 128
@@ -45,6 +49,10 @@ def frequency_encode(positions: Tensor, frequencies: Tensor) -> Tensor:
     Args:
         positions: ``(N, 3)``.
         frequencies: ``(F,)`` in periods a unit of length.
+
+    Example:
+        >>> frequency_encode(torch.tensor([[0.5, 0.0, 0.0]]), torch.tensor([1.0, 2.0])).shape
+        torch.Size([1, 15])
     """
     angle = (positions[:, :, None] * (2.0 * math.pi * frequencies)).flatten(1)
     return torch.cat([positions, angle.sin(), angle.cos()], dim=1)
@@ -58,6 +66,11 @@ class FrequencyField(EncodedField):
     is just determined (Nyquist), which is what a cell is to a grid. The layers behind can make harmonics and so
     finer detail, but an MLP learns low frequencies first: one that is trained for a few hundred steps stays
     coarser than its pitch, not finer.
+
+    Example:
+        >>> field = FrequencyField(FrequencyConfig(resolution=16))
+        >>> field.density_fn(torch.zeros(5, 3)).shape
+        torch.Size([5, 1])
     """
 
     frequencies: Tensor

@@ -35,6 +35,10 @@ class HashConfig:
         initial_opacity: opacity of one finest cell before training.
         contract: False for a scene that lies wholly in [-1, 1]^3.
         seed: of the start values.
+
+    Example:
+        >>> HashConfig(resolution=64, base_resolution=16, levels=3).resolutions
+        (16, 32, 64)
     """
 
     resolution: int = 128
@@ -70,7 +74,12 @@ class HashConfig:
 
 
 def level_rows(resolution: int, rows: int) -> int:
-    """Rows of a level: one for each of ``(resolution + 1)^3`` nodes, at most ``rows``."""
+    """Rows of a level: one for each of ``(resolution + 1)^3`` nodes, at most ``rows``.
+
+    Example:
+        >>> level_rows(4, 2**8), level_rows(8, 2**8)
+        (125, 256)
+    """
     return min((resolution + 1) ** 3, rows)
 
 
@@ -78,6 +87,11 @@ def level_corners(unit: Tensor, resolution: int, rows: int) -> tuple[Tensor, Ten
     """Rows ``(N, 8)`` int32 and weights ``(N, 8)`` of the nodes around ``unit (N, 3)`` in [0, 1].
 
     The eight stand in the order 000, 001, .., 111 of ``xyz``. A NaN gives NaN weights and some valid row.
+
+    Example:
+        >>> index, weights = level_corners(torch.tensor([[0.5, 0.0, 0.0]]), 3, 2**8)
+        >>> index[0].tolist(), weights[0].tolist()
+        ([16, 17, 20, 21, 32, 33, 36, 37], [0.5, 0.0, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0])
     """
     lower, shares = lower_nodes((unit * resolution).unbind(-1), (resolution + 1,) * 3)
     side = resolution + 1
@@ -106,6 +120,12 @@ def hash_encode(table: Tensor, unit: Tensor, resolutions: tuple[int, ...], rows:
 
     Raises:
         ValueError: the table has another number of rows.
+
+    Example:
+        >>> resolutions, rows = (4, 8), 2**8  # 5^3 nodes have a row each, 9^3 share 2^8
+        >>> table = torch.ones(sum(level_rows(resolution, rows) for resolution in resolutions), 2)
+        >>> hash_encode(table, torch.full((3, 3), 0.3), resolutions, rows).shape
+        torch.Size([3, 4])
     """
     sizes = [level_rows(resolution, rows) for resolution in resolutions]
     if len(table) != sum(sizes):
@@ -127,6 +147,11 @@ class HashField(EncodedField):
     """Multi-resolution hash encoding and small networks; see :class:`HashConfig`.
 
     Its ``field_pitch`` is the side of its finest cell: within one, the encoding is trilinear.
+
+    Example:
+        >>> field = HashField(HashConfig(resolution=16, base_resolution=4, levels=2, rows=2**8))
+        >>> field.density_fn(torch.zeros(5, 3)).shape
+        torch.Size([5, 1])
     """
 
     def __init__(self, config: HashConfig | None = None) -> None:

@@ -84,6 +84,10 @@ def make_field(
 
     Raises:
         ValueError: no such kind.
+
+    Example:
+        >>> [type(make_field(kind, 16)).__name__ for kind in ("dense", "hash", "mlp")]
+        ['RadianceField', 'HashField', 'FrequencyField']
     """
     if kind not in KINDS:
         raise ValueError(f"make_field: kind must be one of {', '.join(KINDS)}, got {kind!r}")

@@ -31,6 +31,10 @@ class RadianceConfig:
         color_resolution: colour nodes along an axis.
         initial_opacity: opacity of one cell before training.
         contract: False for a scene that lies wholly in [-1, 1]^3; the grid then covers just that box.
+
+    Example:
+        >>> RadianceField(RadianceConfig(resolution=16, color_resolution=8)).resolution
+        16
     """
 
     resolution: int = 160
@@ -48,7 +52,12 @@ class RadianceConfig:
 
 
 def contract(positions: Tensor) -> Tensor:
-    """Contract ``(..., 3)`` into [-2, 2]^3 (mip-NeRF 360, eq. 10, maximum norm)."""
+    """Contract ``(..., 3)`` into [-2, 2]^3 (mip-NeRF 360, eq. 10, maximum norm).
+
+    Example:
+        >>> contract(torch.tensor([[0.5, 0.0, 0.0], [4.0, 0.0, 0.0]])).tolist()
+        [[0.5, 0.0, 0.0], [1.75, 0.0, 0.0]]
+    """
     norm = positions.abs().amax(dim=-1, keepdim=True).clamp_min(1.0)
     return (2.0 - 1.0 / norm) * positions / norm
 
@@ -57,6 +66,12 @@ class RadianceField(torch.nn.Module):
     """Density and view-dependent colour; see :class:`RadianceConfig`.
 
     ``density = softplus(raw) / cell``, so that a raw value means the same opacity at any resolution.
+
+    Example:
+        >>> field = RadianceField(RadianceConfig(resolution=8, color_resolution=8, initial_opacity=0.01))
+        >>> density = field.density_fn(torch.zeros(1, 3)).detach()
+        >>> round(1 - float(torch.exp(-density * field.field_pitch)), 4)  # opacity of one cell
+        0.01
     """
 
     def __init__(self, config: RadianceConfig | None = None) -> None:

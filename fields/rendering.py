@@ -45,7 +45,14 @@ class Sampling:
 
 @dataclass(frozen=True)
 class Rendering:
-    """Per ray: ``rgb (N, 3)`` without background, ``weights (N, S)``, ``edges (N, S + 1)`` distances."""
+    """Per ray: ``rgb (N, 3)`` without background, ``weights (N, S)``, ``edges (N, S + 1)`` distances.
+
+    Example:
+        >>> weights, edges = torch.tensor([[0.5, 0.25, 0.0]]), torch.tensor([[0.0, 1.0, 2.0, 3.0]])
+        >>> rendering = Rendering(torch.zeros(1, 3), weights, edges, torch.zeros(1, 3, 3), torch.zeros(1, 3))
+        >>> rendering.accumulation.tolist()
+        [0.75]
+    """
 
     rgb: Tensor
     weights: Tensor
@@ -71,6 +78,14 @@ def render_rays(
     """Render rays ``(N, 3)``; with a generator, samples are jittered within their intervals.
 
     ``occupied``: nodes of the field's ``occupied_nodes``; samples nearest to other nodes are taken as empty.
+
+    Example:
+        >>> from unghost.fields.radiance import RadianceConfig, RadianceField
+        >>> field = RadianceField(RadianceConfig(resolution=8, color_resolution=8, initial_opacity=0.5))
+        >>> origins, directions = torch.zeros(1, 3), torch.tensor([[0.0, 0.0, -1.0]])
+        >>> rendering = render_rays(field, origins, directions, Sampling())
+        >>> round(float(rendering.accumulation[0].detach()), 2)  # share of the light that the field stops
+        1.0
     """
     edges = sampling.edges().expand(len(origins), -1)
     fraction = torch.rand(len(origins), edges.shape[1] - 1, generator=generator) if generator else torch.tensor(0.5)
@@ -101,6 +116,13 @@ def depth_spread(rendering: Rendering) -> Tensor:
     """``(N,)`` standard deviation of the logarithm of where a ray ends; light that gets through ends at the last edge.
 
     About the relative error of a depth that is read off the ray: 0 for a sharp surface, large in fog.
+
+    Example:
+        >>> edges = torch.tensor([[0.0, 1.0, 2.0, 3.0]])
+        >>> weights = torch.tensor([[0.5, 0.4, 0.0]])
+        >>> rendering = Rendering(torch.zeros(1, 3), weights, edges, torch.zeros(1, 3, 3), torch.zeros(1, 3))
+        >>> depth_spread(rendering).shape
+        torch.Size([1])
     """
     edges = rendering.edges
     middles = torch.log((edges[:, 1:] + edges[:, :-1]) / 2.0)
@@ -112,7 +134,15 @@ def depth_spread(rendering: Rendering) -> Tensor:
 
 
 def median_distance(rendering: Rendering) -> Tensor:
-    """``(N,)`` distance along the ray at which transmittance falls below one half; inf where it never does."""
+    """``(N,)`` distance along the ray at which transmittance falls below one half; inf where it never does.
+
+    Example:
+        >>> edges = torch.tensor([[0.0, 1.0, 2.0, 3.0]])
+        >>> weights = torch.tensor([[0.5, 0.4, 0.0]])
+        >>> rendering = Rendering(torch.zeros(1, 3), weights, edges, torch.zeros(1, 3, 3), torch.zeros(1, 3))
+        >>> median_distance(rendering).tolist()
+        [1.0]
+    """
     accumulated = torch.cumsum(rendering.weights, dim=1)
     reached = accumulated >= 0.5
     index = reached.to(torch.int8).argmax(dim=1, keepdim=True)
@@ -148,6 +178,13 @@ def render_view(
         ``rgb (H, W, 3)`` in [0, 1]; ``depth (H, W)``: distance along the unit ray at which the
         transmittance falls below one half, inf where it never does; ``accumulation (H, W)``;
         ``spread (H, W)``: :func:`depth_spread`; with ``values``, ``values (H, W)``: their sum by rendering weight.
+
+    Example:
+        >>> from unghost.fields.radiance import RadianceConfig, RadianceField
+        >>> cameras = Cameras.create(np.eye(3, 4)[None], np.array([8.0, 8.0, 4.0, 3.0]), 8, 6)
+        >>> view = render_view(RadianceField(RadianceConfig(resolution=8, color_resolution=8)), cameras, 0)
+        >>> {name: array.shape for name, array in view.items()}
+        {'rgb': (6, 8, 3), 'depth': (6, 8), 'accumulation': (6, 8), 'spread': (6, 8)}
     """
     sampling = sampling or Sampling()
     origins, directions = cameras.rays(index)

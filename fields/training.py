@@ -64,6 +64,12 @@ def gather_rays(cameras: Cameras, images: NDArray[np.float32]) -> tuple[Tensor, 
 
     Raises:
         ValueError: ``images`` is not ``(N, height, width, 3)`` for the N cameras, or not floating point.
+
+    Example:
+        >>> cameras = Cameras.create(np.eye(3, 4)[None], np.array([8.0, 8.0, 4.0, 3.0]), 8, 6)
+        >>> origins, directions, colors = gather_rays(cameras, np.zeros((1, 6, 8, 3), np.float32))
+        >>> directions.shape, bool((directions[:, 2] < 0).all())  # one ray a pixel, looking along -z
+        (torch.Size([48, 3]), True)
     """
     expected = (len(cameras), cameras.height, cameras.width, 3)
     if images.shape != expected:
@@ -159,6 +165,15 @@ def train_field(
     Raises:
         ValueError: ``images`` do not fit the cameras, or ``steps`` or ``seconds`` is missing or not positive.
         FloatingPointError: the loss is not finite.
+
+    Example:
+        >>> from unghost.fields.radiance import RadianceConfig, RadianceField
+        >>> cameras = Cameras.create(np.eye(3, 4)[None], np.array([8.0, 8.0, 4.0, 3.0]), 8, 6)
+        >>> field = RadianceField(RadianceConfig(resolution=8, color_resolution=8))
+        >>> photos = np.full((1, 6, 8, 3), 0.5, np.float32)
+        >>> report = train_field(field, cameras, photos, steps=2, config=TrainingConfig(rays=16))
+        >>> sorted(report), report["steps"]
+        (['psnr', 'seconds', 'steps'], 2)
     """
     config = config or TrainingConfig()
     generator = torch.Generator().manual_seed(seed)

@@ -67,6 +67,11 @@ def weighted_rows(table: Tensor, index: Tensor, weights: Tensor) -> Tensor:
 
     Returns:
         ``(N, C)``, differentiable with respect to the table.
+
+    Example:
+        >>> index, weights = torch.zeros(1, 8, dtype=torch.int32), torch.full((1, 8), 0.125)
+        >>> weighted_rows(torch.tensor([[3.0], [5.0]]), index, weights).tolist()
+        [[3.0]]
     """
     result: Tensor = _Lookup.apply(table, index, weights)  # type: ignore[no-untyped-call]
     return result
@@ -82,6 +87,11 @@ def trilinear(table: Tensor, coordinates: Tensor, resolution: int) -> Tensor:
 
     Returns:
         ``(N, C)``, differentiable with respect to the table.
+
+    Example:
+        >>> table = torch.arange(8.0)[:, None]  # 2^3 nodes of one channel: 4 x + 2 y + z
+        >>> trilinear(table, torch.tensor([[0.5, 0.0, 1.0]]), 2).tolist()
+        [[3.0]]
     """
     if table.shape[0] != resolution**3:
         raise ValueError(

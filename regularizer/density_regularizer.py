@@ -72,8 +72,15 @@ class DensityRegularizer:
         totals: the same since the start, and observations_outside.
 
     Example:
-        >>> regularizer = DensityRegularizer(denoiser, aabb=aabb, cameras=cameras)  # doctest: +SKIP
-        >>> loss = photometric + sum(regularizer(field.density_fn).values())  # doctest: +SKIP
+        >>> from unghost import load_denoiser
+        >>> level = torch.full((), 20.0, requires_grad=True)  # stands for a field's parameters
+        >>> def density_fn(positions):
+        ...     return level * (positions.norm(dim=-1) < 0.5)
+        >>> regularizer = DensityRegularizer(load_denoiser(), aabb=[[-1] * 3, [1] * 3], field_pitch=0.05, cubes=2)
+        >>> losses = regularizer(density_fn)
+        >>> sum(losses.values()).backward()  # add them to your photometric loss
+        >>> sorted(losses), bool(torch.isfinite(level.grad))
+        (['dsds', 'visibility'], True)
     """
 
     def __init__(

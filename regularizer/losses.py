@@ -91,6 +91,10 @@ def visibility_loss(density: Tensor, view_count: Tensor, *, min_views: int = 1) 
 
     Raises:
         ValueError: shapes differ, or ``min_views < 1``.
+
+    Example:
+        >>> visibility_loss(torch.tensor([2.0, 2.0]), torch.tensor([0, 3])).tolist()
+        [2.0, 0.0]
     """
     if view_count.shape != density.shape:
         raise ValueError(
@@ -114,6 +118,10 @@ def stable_mean(loss: Tensor, *, count: int | None = None) -> Tensor:
 
     Returns:
         Scalar float64 (float32 on mps); exactly 0 for an empty tensor.
+
+    Example:
+        >>> stable_mean(torch.full((4,), 3e38)).item() < 3.1e38  # a float32 sum would overflow
+        True
     """
     wide = widest(loss)
     return (wide / max(loss.numel() if count is None else count, 1)).sum()
@@ -141,6 +149,12 @@ def cubewise_mean(
         Scalar float64 (float32 on mps); exactly 0 where nothing is used. It can be differentiated once. The gradient is
         finite wherever ``density`` is; the mean is inf where a ``density * factor`` is beyond 1.8e308 (3.4e38 on mps),
         which only densities given in float64 can reach at a ``factor`` > 1.
+
+    Example:
+        >>> density, x0_pred = torch.full((2, 2, 2, 2), 3.0), -torch.ones(2, 2, 2, 2)
+        >>> factor, used = torch.full((2, 1, 1, 1), 0.5, dtype=torch.float64), torch.ones(2, 2, 2, 2, dtype=torch.bool)
+        >>> cubewise_mean(lambda d, x: dsds_loss(d, x, target_density=1.0), density, x0_pred, factor, used).item()
+        1.5
     """
     result: Tensor = _CubewiseMean.apply(density, loss, x0_pred, factor, used)  # type: ignore[no-untyped-call]
     return result

@@ -48,8 +48,14 @@ class RemovalLoss:
         ValueError: a weight, samples or chunk out of range.
 
     Example:
-        >>> removal = RemovalLoss(clean(field.density_fn, aabb, field_pitch=pitch))  # doctest: +SKIP
-        >>> loss = photometric + removal(field.density_fn)  # doctest: +SKIP
+        >>> cells = np.ones((4, 4, 4), dtype=bool)
+        >>> cells[2:] = False  # what clean() would remove
+        >>> removal = RemovalLoss(KeepMask(np.array([[0.0] * 3, [4.0] * 3]), 1.0, cells), weight=1.0, samples=64)
+        >>> density = torch.tensor(0.5, requires_grad=True)
+        >>> loss = removal(lambda positions: density.expand(len(positions)))  # add it to your photometric loss
+        >>> loss.backward()
+        >>> round(loss.item(), 3), round(density.grad.item(), 3)
+        (0.5, 1.0)
     """
 
     def __init__(

@@ -52,6 +52,10 @@ class RegularizerSettings:
         grid_resolution, grid_decay: of the importance grid (20: the paper).
         chunk: most positions handed to a density function at once.
         seed: of everything random.
+
+    Example:
+        >>> RegularizerSettings(cubes=12).cubes, RegularizerSettings.paper().rule.threshold
+        (12, 0.01)
     """
 
     cubes: int = 40

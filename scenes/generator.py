@@ -48,6 +48,13 @@ class PhotographedScene:
         images: ``(N, H, W, 3)`` float32 in [0, 1], with exposure and pixel noise.
         depth_maps: ``(N, H, W)`` depth along the optical axis, inf for sky.
         look: what the camera does to every colour: how much it mutes and how much it veils, each in [0, 1].
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> scene = random_scene(rng)
+        >>> shot = photograph(rng, scene, count=2, width=8, height=6)
+        >>> shot.depth_maps.shape, bool((shot.depth_maps > 0).all())
+        ((2, 6, 8), True)
     """
 
     scene: SolidScene
@@ -62,6 +69,12 @@ def random_scene(rng: np.random.Generator, objects: Sequence[SampledDistance] = 
     """A furnished room, or (one in four) objects on an open floor. Cameras are meant to lie in [-1, 1]^3.
 
     Each of ``objects`` (solids of longest side 1) stands somewhere on the floor, beside the furniture.
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> scene = random_scene(rng)
+        >>> len(scene.solids) > 5
+        True
     """
     solids: list[Solid] = []
     indoor = rng.random() < 0.75
@@ -122,7 +135,15 @@ def sweep(rng: np.random.Generator, scene: SolidScene, count: int) -> Array:
 def photograph(
     rng: np.random.Generator, scene: SolidScene, *, count: int, width: int, height: int
 ) -> PhotographedScene:
-    """Take ``count`` photos along a casual sweep, with the faults that casual photos have."""
+    """Take ``count`` photos along a casual sweep, with the faults that casual photos have.
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> scene = random_scene(rng)
+        >>> shot = photograph(rng, scene, count=2, width=8, height=6)
+        >>> shot.images.shape, len(shot.cameras)
+        ((2, 6, 8, 3), 2)
+    """
     poses = sweep(rng, scene, count)
     focal = width / (2 * np.tan(np.deg2rad(rng.uniform(50, 75)) / 2))
     intrinsics = np.array([focal, focal, width / 2, height / 2])
@@ -149,6 +170,13 @@ def photograph_again(rng: np.random.Generator, first: PhotographedScene, *, coun
 
     Raises:
         RuntimeError: there is no free path through the scene.
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> scene = random_scene(rng)
+        >>> again = photograph_again(rng, photograph(rng, scene, count=2, width=8, height=6), count=3)
+        >>> again.images.shape
+        (3, 6, 8, 3)
     """
     lens = first.true_cameras
     cameras = Cameras.create(sweep(rng, first.scene, count), lens.intrinsics[0], lens.width, lens.height)
@@ -179,6 +207,13 @@ def observers(
     Returns:
         The cameras, and depth along the optical axis ``(count, height, width)``, inf for sky. No cameras if there is
         no free path.
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> scene = random_scene(rng)
+        >>> cameras, depth = observers(rng, scene, count=3, width=8, height=6)
+        >>> len(cameras), depth.shape
+        (3, (3, 6, 8))
     """
     try:
         poses = sweep(rng, scene, count)

@@ -26,7 +26,13 @@ class Volume:
 
 
 def look_at(eye: Any, target: Any, *, width: int, height: int, fov_degrees: float) -> Cameras:
-    """One camera at ``eye`` that looks at ``target`` with z up; ``fov_degrees`` is horizontal."""
+    """One camera at ``eye`` that looks at ``target`` with z up; ``fov_degrees`` is horizontal.
+
+    Example:
+        >>> camera = look_at([2.0, 0.0, 0.0], [0.0, 0.0, 0.0], width=8, height=6, fov_degrees=60)
+        >>> camera.origins.tolist()
+        [[2.0, 0.0, 0.0]]
+    """
     eye, target = np.asarray(eye, dtype=float), np.asarray(target, dtype=float)
     back = (eye - target) / np.linalg.norm(eye - target)
     right = np.cross([0.0, 0.0, 1.0], back)
@@ -57,6 +63,13 @@ def shade(density: Floats, color: Floats, aabb: NDArray[np.float64], pitch: floa
         color: ``(X, Y, Z, 3)`` albedo in [0, 1].
         aabb: ``(2, 3)``, scene units.
         pitch: side of a cell, scene units.
+
+    Example:
+        >>> aabb = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+        >>> density = np.zeros((8, 8, 8), np.float32)
+        >>> density[2:6, 2:6, 2:6] = 20.0
+        >>> shade(density, np.full((8, 8, 8, 3), 0.5, np.float32), aabb, 0.25).samples.shape
+        (8, 8, 8, 4)
     """
     from scipy.ndimage import gaussian_filter, maximum_filter
 
@@ -85,7 +98,17 @@ def _interval(aabb: NDArray[np.float64], origins: Any, directions: Any) -> tuple
 
 
 def render(volume: Volume, camera: Cameras, *, steps_per_cell: float = 1.6) -> Floats:
-    """March every pixel's ray through the volume; ``(height, width, 3)`` in [0, 1] on a paper background."""
+    """March every pixel's ray through the volume; ``(height, width, 3)`` in [0, 1] on a paper background.
+
+    Example:
+        >>> aabb = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+        >>> density = np.zeros((8, 8, 8), np.float32)
+        >>> density[2:6, 2:6, 2:6] = 20.0
+        >>> volume = shade(density, np.full((8, 8, 8, 3), 0.5, np.float32), aabb, 0.25)
+        >>> picture = render(volume, look_at([4.0, 0.0, 0.0], [0.0, 0.0, 0.0], width=16, height=12, fov_degrees=60))
+        >>> picture.shape, bool(np.allclose(picture[0, 0], PAPER, atol=1e-6))  # a corner shows the background
+        ((12, 16, 3), True)
+    """
     from scipy.ndimage import distance_transform_cdt, maximum_filter
 
     origins, directions = (values.reshape(-1, 3) for values in camera.rays(0))

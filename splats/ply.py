@@ -78,6 +78,11 @@ class Gaussians:
         extents: ``(N, 3)`` standard deviations along their own axes, scene units, > 0.
         rotations: ``(N, 3, 3)``, columns are their own axes.
         logits: ``(N,)``, of the opacity.
+
+    Example:
+        >>> gaussians = Gaussians(np.zeros((1, 3)), np.full((1, 3), 0.1), np.eye(3)[None], np.zeros(1))
+        >>> gaussians.opacity().tolist()
+        [0.5]
     """
 
     means: NDArray[np.float64]
@@ -146,6 +151,17 @@ def read_splat_ply(path: str | Path) -> SplatPly:
         FileNotFoundError: no such file.
         ValueError: not a binary little-endian PLY of one element ``vertex`` of plain numbers, without the properties of
             3D Gaussian splatting, or shorter or longer than its header says.
+
+    Example:
+        >>> import tempfile
+        >>> lines = ["ply", "format binary_little_endian 1.0", "element vertex 2"]
+        >>> lines += [*(f"property float {name}" for name in _NEEDED), "end_header", ""]
+        >>> content = chr(10).join(lines).encode() + np.ones((2, len(_NEEDED)), "<f4").tobytes()
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = Path(folder, "two.ply").write_bytes(content)
+        ...     splats = read_splat_ply(Path(folder, "two.ply"))
+        ...     print(len(splats), splats.gaussians().means.tolist())
+        2 [[1.0, 1.0, 1.0], [1.0, 1.0, 1.0]]
     """
     source = Path(path)
     if not source.is_file():
@@ -213,6 +229,18 @@ def write_splat_ply(
 
     Raises:
         ValueError: wrong shapes, or the file being written is the one being read.
+
+    Example:
+        >>> import tempfile
+        >>> lines = ["ply", "format binary_little_endian 1.0", "element vertex 2"]
+        >>> lines += [*(f"property float {name}" for name in _NEEDED), "end_header", ""]
+        >>> content = chr(10).join(lines).encode() + np.ones((2, len(_NEEDED)), "<f4").tobytes()
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     source, target = Path(folder, "two.ply"), Path(folder, "one.ply")
+        ...     _ = source.write_bytes(content)
+        ...     write_splat_ply(target, read_splat_ply(source), keep=np.array([True, False]))
+        ...     print(len(read_splat_ply(target)))
+        1
     """
     target = Path(path)
     for name, array in (("keep", keep), ("keep_score", keep_score)):

@@ -61,8 +61,8 @@ def load_denoiser(
         ImportError: ``"torch"`` without the extra ``unghost[torch]``.
 
     Example:
-        >>> denoiser = load_denoiser()  # doctest: +SKIP
-        >>> denoiser.manifest.channels  # doctest: +SKIP
+        >>> denoiser = load_denoiser()
+        >>> denoiser.manifest.channels
         ('signed_opacity',)
     """
     if backend is not None and backend not in _LOADERS:

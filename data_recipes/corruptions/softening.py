@@ -43,7 +43,12 @@ def _separable(matrices: tuple[Matrix, Matrix, Matrix], grid: Grid) -> Grid:
 
 
 def coarse_noise(rng: np.random.Generator, cells: int, resolution: int) -> Grid:
-    """Standard normal noise on ``cells^3`` nodes, trilinearly upsampled to ``(R, R, R)``."""
+    """Standard normal noise on ``cells^3`` nodes, trilinearly upsampled to ``(R, R, R)``.
+
+    Example:
+        >>> coarse_noise(np.random.default_rng(0), 4, 32).shape
+        (32, 32, 32)
+    """
     matrix = _upsampling(min(cells, resolution), resolution)
     return _separable((matrix,) * 3, rng.standard_normal((matrix.shape[1],) * 3, dtype=np.float32))
 
@@ -118,6 +123,14 @@ def soften(
 
     Returns:
         ``(R, R, R)`` float32 in [-1, 1].
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> clean = np.zeros((32, 32, 32), dtype=bool)
+        >>> clean[:, :, 10:13] = True  # a slab
+        >>> signed = soften(rng, clean, clean, 0.5)
+        >>> signed.shape, bool(signed.min() >= -1), bool(signed[clean].mean() > signed[~clean].mean())
+        ((32, 32, 32), True, True)
     """
     if clean.shape != corrupted.shape or clean.dtype != np.bool_ or corrupted.dtype != np.bool_:
         raise ValueError(

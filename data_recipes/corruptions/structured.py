@@ -38,6 +38,10 @@ def changed_fraction(severity: float) -> float:
 
     Linear between a few points that were chosen so that the mean IoU of input and clean cube falls as
     in the study that this project began with (0.96, 0.89, 0.74, 0.6).
+
+    Example:
+        >>> changed_fraction(0.0), changed_fraction(0.3) < changed_fraction(1.0)
+        (0.0, True)
     """
     if not 0.0 <= severity <= 1.0:
         raise ValueError(f"changed_fraction: severity must lie in [0, 1], got {severity}")
@@ -117,7 +121,15 @@ def _surface_voxels(rng: np.random.Generator, occupancy: Occupancy, count: int) 
 
 
 def detached_blobs(rng: np.random.Generator, occupancy: Occupancy, severity: float) -> Occupancy:
-    """1 to 12 lumpy ellipsoids in free space, at least two voxels from any surface."""
+    """1 to 12 lumpy ellipsoids in free space, at least two voxels from any surface.
+
+    Example:
+        >>> clean = np.zeros((32, 32, 32), dtype=bool)
+        >>> clean[:, :, 10:13] = True  # a slab
+        >>> corrupted = detached_blobs(np.random.default_rng(0), clean, 0.5)
+        >>> bool((corrupted & ~clean).any()), bool((clean & ~corrupted).any())  # voxels added, taken away
+        (True, False)
+    """
     budget = _budget(rng, occupancy, severity)
     centers = rng.uniform(-1, occupancy.shape[0], size=(round(log_uniform(rng, 1, 12)), 3))
     score = _lumpy(rng, _blobs(rng, centers, occupancy.shape[0], elongation=3.0, along=None), 3.0)
@@ -125,7 +137,15 @@ def detached_blobs(rng: np.random.Generator, occupancy: Occupancy, severity: flo
 
 
 def touching_floaters(rng: np.random.Generator, occupancy: Occupancy, severity: float) -> Occupancy:
-    """1 to 10 lumpy ellipsoids grown from surface voxels."""
+    """1 to 10 lumpy ellipsoids grown from surface voxels.
+
+    Example:
+        >>> clean = np.zeros((32, 32, 32), dtype=bool)
+        >>> clean[:, :, 10:13] = True  # a slab
+        >>> corrupted = touching_floaters(np.random.default_rng(0), clean, 0.5)
+        >>> bool((corrupted & ~clean).any()), bool((clean & ~corrupted).any())  # voxels added, taken away
+        (True, False)
+    """
     budget = _budget(rng, occupancy, severity)
     count = round(log_uniform(rng, 1, 10))
     centers = _surface_voxels(rng, occupancy, count) + rng.normal(scale=2.0, size=(count, 3))
@@ -134,7 +154,15 @@ def touching_floaters(rng: np.random.Generator, occupancy: Occupancy, severity: 
 
 
 def fog_sheets(rng: np.random.Generator, occupancy: Occupancy, severity: float) -> Occupancy:
-    """1 to 3 warped, broken sheets of 1 to 5 voxels through free space."""
+    """1 to 3 warped, broken sheets of 1 to 5 voxels through free space.
+
+    Example:
+        >>> clean = np.zeros((32, 32, 32), dtype=bool)
+        >>> clean[:, :, 10:13] = True  # a slab
+        >>> corrupted = fog_sheets(np.random.default_rng(0), clean, 0.5)
+        >>> bool((corrupted & ~clean).any()), bool((clean & ~corrupted).any())  # voxels added, taken away
+        (True, False)
+    """
     budget, resolution = _budget(rng, occupancy, severity), occupancy.shape[0]
     score: Score = np.full(occupancy.shape, _NEVER)
     for _ in range(int(rng.integers(1, 4))):
@@ -153,7 +181,15 @@ def fog_sheets(rng: np.random.Generator, occupancy: Occupancy, severity: float) 
 
 
 def fog_volumes(rng: np.random.Generator, occupancy: Occupancy, severity: float) -> Occupancy:
-    """Thick low-frequency fog, often cut by the cube's border, ragged at its rim."""
+    """Thick low-frequency fog, often cut by the cube's border, ragged at its rim.
+
+    Example:
+        >>> clean = np.zeros((32, 32, 32), dtype=bool)
+        >>> clean[:, :, 10:13] = True  # a slab
+        >>> corrupted = fog_volumes(np.random.default_rng(0), clean, 0.5)
+        >>> bool((corrupted & ~clean).any()), bool((clean & ~corrupted).any())  # voxels added, taken away
+        (True, False)
+    """
     budget, resolution = _budget(rng, occupancy, severity), occupancy.shape[0]
     gradient = rng.normal(size=3) * rng.uniform(0, 2.0) / resolution
     score = coarse_noise(rng, int(rng.integers(2, 5)), resolution)
@@ -163,7 +199,15 @@ def fog_volumes(rng: np.random.Generator, occupancy: Occupancy, severity: float)
 
 
 def holes(rng: np.random.Generator, occupancy: Occupancy, severity: float) -> Occupancy:
-    """1 to 8 lumpy holes torn into the surface."""
+    """1 to 8 lumpy holes torn into the surface.
+
+    Example:
+        >>> clean = np.zeros((32, 32, 32), dtype=bool)
+        >>> clean[:, :, 10:13] = True  # a slab
+        >>> corrupted = holes(np.random.default_rng(0), clean, 0.5)
+        >>> bool((corrupted & ~clean).any()), bool((clean & ~corrupted).any())  # voxels added, taken away
+        (False, True)
+    """
     budget = _budget(rng, occupancy, severity)
     centers = _surface_voxels(rng, occupancy, round(log_uniform(rng, 1, 8)))
     score = _lumpy(rng, _blobs(rng, centers, occupancy.shape[0], elongation=2.5, along=None), 3.0)
@@ -171,7 +215,15 @@ def holes(rng: np.random.Generator, occupancy: Occupancy, severity: float) -> Oc
 
 
 def rough_surface(rng: np.random.Generator, occupancy: Occupancy, severity: float) -> Occupancy:
-    """Bumps on and pits in the surface, one voxel deep, in patches."""
+    """Bumps on and pits in the surface, one voxel deep, in patches.
+
+    Example:
+        >>> clean = np.zeros((32, 32, 32), dtype=bool)
+        >>> clean[:, :, 10:13] = True  # a slab
+        >>> corrupted = rough_surface(np.random.default_rng(0), clean, 0.5)
+        >>> bool((corrupted & ~clean).any()), bool((clean & ~corrupted).any())  # voxels added, taken away
+        (True, True)
+    """
     budget = _budget(rng, occupancy, severity)
     outer, inner = dilate(occupancy, 1) & ~occupancy, occupancy & dilate(~occupancy, 1, faces_only=True)
     score = coarse_noise(rng, int(rng.integers(10, 33)), occupancy.shape[0])
@@ -181,7 +233,15 @@ def rough_surface(rng: np.random.Generator, occupancy: Occupancy, severity: floa
 
 
 def swollen_surface(rng: np.random.Generator, occupancy: Occupancy, severity: float) -> Occupancy:
-    """Parts of the surface grown by up to three voxels."""
+    """Parts of the surface grown by up to three voxels.
+
+    Example:
+        >>> clean = np.zeros((32, 32, 32), dtype=bool)
+        >>> clean[:, :, 10:13] = True  # a slab
+        >>> corrupted = swollen_surface(np.random.default_rng(0), clean, 0.5)
+        >>> bool((corrupted & ~clean).any()), bool((clean & ~corrupted).any())  # voxels added, taken away
+        (True, False)
+    """
     budget = _budget(rng, occupancy, severity)
     score = coarse_noise(rng, int(rng.integers(2, 7)), occupancy.shape[0])
     once = dilate(occupancy, 1)
@@ -203,7 +263,15 @@ def _shifted(occupancy: Occupancy, shift: NDArray[Any]) -> Occupancy:
 
 
 def doubled_surface(rng: np.random.Generator, occupancy: Occupancy, severity: float) -> Occupancy:
-    """A second copy of patches of the surface, 2 to 8 voxels off, as wrong depths or poses leave it."""
+    """A second copy of patches of the surface, 2 to 8 voxels off, as wrong depths or poses leave it.
+
+    Example:
+        >>> clean = np.zeros((32, 32, 32), dtype=bool)
+        >>> clean[:, :, 10:13] = True  # a slab
+        >>> corrupted = doubled_surface(np.random.default_rng(0), clean, 0.5)
+        >>> bool((corrupted & ~clean).any()), bool((clean & ~corrupted).any())  # voxels added, taken away
+        (True, False)
+    """
     budget, resolution = _budget(rng, occupancy, severity), occupancy.shape[0]
     direction = rng.normal(size=3)
     shift = np.rint(direction / np.linalg.norm(direction) * rng.uniform(2.0, max(2.0, min(8.5, resolution / 2))))
@@ -213,7 +281,15 @@ def doubled_surface(rng: np.random.Generator, occupancy: Occupancy, severity: fl
 
 
 def streaks(rng: np.random.Generator, occupancy: Occupancy, severity: float) -> Occupancy:
-    """2 to 16 spindles that point at one camera, 3 to 16 times as long as thick, starting anywhere or on a surface."""
+    """2 to 16 spindles that point at one camera, 3 to 16 times as long as thick, starting anywhere or on a surface.
+
+    Example:
+        >>> clean = np.zeros((32, 32, 32), dtype=bool)
+        >>> clean[:, :, 10:13] = True  # a slab
+        >>> corrupted = streaks(np.random.default_rng(0), clean, 0.5)
+        >>> bool((corrupted & ~clean).any()), bool((clean & ~corrupted).any())  # voxels added, taken away
+        (True, False)
+    """
     budget, resolution = _budget(rng, occupancy, severity), occupancy.shape[0]
     count = round(log_uniform(rng, 2, 16))
     centers = rng.uniform(0, resolution, size=(count, 3))
@@ -226,7 +302,15 @@ def streaks(rng: np.random.Generator, occupancy: Occupancy, severity: float) -> 
 
 
 def blocks(rng: np.random.Generator, occupancy: Occupancy, severity: float) -> Occupancy:
-    """Whole cells of 2 to 5 voxels of a coarser grid, as voxel and hash grids leave them."""
+    """Whole cells of 2 to 5 voxels of a coarser grid, as voxel and hash grids leave them.
+
+    Example:
+        >>> clean = np.zeros((32, 32, 32), dtype=bool)
+        >>> clean[:, :, 10:13] = True  # a slab
+        >>> corrupted = blocks(np.random.default_rng(0), clean, 0.5)
+        >>> bool((corrupted & ~clean).any()), bool((clean & ~corrupted).any())  # voxels added, taken away
+        (True, False)
+    """
     budget, resolution = _budget(rng, occupancy, severity), occupancy.shape[0]
     cell = int(rng.integers(2, 6))
     cells = -(-resolution // cell) + 1
@@ -239,7 +323,15 @@ def blocks(rng: np.random.Generator, occupancy: Occupancy, severity: float) -> O
 
 
 def salt(rng: np.random.Generator, occupancy: Occupancy, severity: float) -> Occupancy:
-    """Single voxels flipped, most of them in free space, somewhat clustered."""
+    """Single voxels flipped, most of them in free space, somewhat clustered.
+
+    Example:
+        >>> clean = np.zeros((32, 32, 32), dtype=bool)
+        >>> clean[:, :, 10:13] = True  # a slab
+        >>> corrupted = salt(np.random.default_rng(0), clean, 0.5)
+        >>> bool((corrupted & ~clean).any()), bool((clean & ~corrupted).any())  # voxels added, taken away
+        (True, False)
+    """
     budget, resolution = 0.5 * _budget(rng, occupancy, severity), occupancy.shape[0]
     score = rng.random(occupancy.shape, dtype=np.float32)
     score += np.float32(rng.uniform(0, 0.3)) * coarse_noise(rng, int(rng.integers(2, 6)), resolution)
@@ -272,6 +364,14 @@ def corrupt(rng: np.random.Generator, occupancy: Occupancy, severity: float) -> 
     Args:
         occupancy: ``(R, R, R)`` bool.
         severity: [0, 1]; 0 is the identity.
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> clean = np.zeros((32, 32, 32), dtype=bool)
+        >>> clean[:, :, 10:13] = True  # a slab
+        >>> corrupted = corrupt(rng, clean, 0.5)
+        >>> bool((corrupt(rng, clean, 0.0) == clean).all()), bool((corrupted != clean).any())
+        (True, True)
     """
     _check(occupancy)
     total = changed_fraction(severity)

@@ -136,6 +136,13 @@ def compose_object(rng: np.random.Generator, recipe: Recipe) -> ComposedObject:
     """A random object: the first solid is the largest, the others are placed about it and added, blended or cut.
 
     A third of the objects are axis-aligned among themselves, as furniture and rooms are.
+
+    Example:
+        >>> from unghost.data_recipes.recipe import load_recipe
+        >>> rng, recipe = np.random.default_rng(0), load_recipe("procedural")
+        >>> composed = compose_object(rng, recipe)
+        >>> composed.distance(np.zeros((4, 3))).shape
+        (4,)
     """
     count = round(log_uniform(rng, recipe.parts[0], recipe.parts[1]))
     extents = np.sort(log_uniform(rng, *recipe.part_extent, count))[::-1]
@@ -182,6 +189,14 @@ def surface_point(rng: np.random.Generator, composed: ComposedObject, *, tries: 
     of those that lie on the whole object's surface is taken. A part without any (buried, or a cavity beside
     the solids) is replaced by another one, up to four times; then the nearest miss is taken. Parts are
     equally likely whatever their extent, which favours detail.
+
+    Example:
+        >>> from unghost.data_recipes.recipe import load_recipe
+        >>> rng, recipe = np.random.default_rng(0), load_recipe("procedural")
+        >>> composed = compose_object(rng, recipe)
+        >>> point, normal = surface_point(rng, composed)
+        >>> bool(abs(composed.distance(point[None])[0]) < 0.05), round(float(np.linalg.norm(normal)), 3)
+        (True, 1.0)
     """
     best: tuple[float, Array, Array] | None = None
     for row in rng.permutation(len(composed.parts))[:4]:
@@ -207,6 +222,12 @@ def dilate(occupancy: Occupancy, iterations: int, *, faces_only: bool = False) -
         occupancy: ``(R, R, R)`` bool.
         iterations: >= 0.
         faces_only: 6 neighbours rather than 26.
+
+    Example:
+        >>> point = np.zeros((3, 3, 3), dtype=bool)
+        >>> point[1, 1, 1] = True
+        >>> [int(dilate(point, 1, faces_only=faces).sum()) for faces in (False, True)]
+        [27, 7]
     """
     if iterations < 0:
         raise ValueError(f"dilate: iterations must be >= 0, got {iterations}")
@@ -223,7 +244,14 @@ def dilate(occupancy: Occupancy, iterations: int, *, faces_only: bool = False) -
 
 
 def random_dilation(rng: np.random.Generator, occupancy: Occupancy, maximum: int) -> Occupancy:
-    """Dilate 0 to ``maximum`` times, each count half as likely as the one before."""
+    """Dilate 0 to ``maximum`` times, each count half as likely as the one before.
+
+    Example:
+        >>> point = np.zeros((5, 5, 5), dtype=bool)
+        >>> point[2, 2, 2] = True
+        >>> bool(random_dilation(np.random.default_rng(0), point, 2)[2, 2, 2])
+        True
+    """
     weights = 0.5 ** np.arange(maximum + 1)
     count = int(rng.choice(maximum + 1, p=weights / weights.sum()))
     return dilate(occupancy, count, faces_only=bool(rng.random() < 0.5))
@@ -239,6 +267,11 @@ def shell_from_distance(distance: Array, *, thickness: float = 1.0) -> Occupancy
     Args:
         distance: ``(R, R, R)``, any unit.
         thickness: 1 is the exact test for a plane.
+
+    Example:
+        >>> height = np.broadcast_to(np.arange(8.0) - 3.0, (8, 8, 8))  # of a plane through the voxels of index 3
+        >>> shell_from_distance(height)[0, 0].tolist()
+        [False, False, False, True, False, False, False, False]
     """
     slopes = np.zeros_like(distance)
     for axis in range(3):
@@ -270,6 +303,12 @@ def sample_cube(rng: np.random.Generator, recipe: Recipe) -> tuple[Occupancy, fl
     Returns:
         ``occupancy (32, 32, 32)`` bool, the cube's edge over the object's extent, and where the cube lay in the
         coordinates of its object; None for a cube that is empty by choice, for which no object was composed.
+
+    Example:
+        >>> from unghost.data_recipes.recipe import load_recipe
+        >>> occupancy, edge_fraction, frame = sample_cube(np.random.default_rng(0), load_recipe("procedural"))
+        >>> occupancy.shape, bool(occupancy.any()), 0 < edge_fraction <= 1
+        ((32, 32, 32), True, True)
     """
     fraction = log_uniform(rng, *recipe.edge_fraction)
     if rng.random() < recipe.empty_share:

@@ -144,6 +144,11 @@ def random_solid(rng: np.random.Generator, settings: CsgSettings | None = None) 
 
     Raises:
         ImportError: manifold3d is not installed.
+
+    Example:
+        >>> solid = random_solid(np.random.default_rng(0))
+        >>> bool(solid.volume() > 0)
+        True
     """
     m, settings = _manifold3d(), settings or CsgSettings()
     whole = _leaf(m, rng, settings)
@@ -171,7 +176,12 @@ def random_solid(rng: np.random.Generator, settings: CsgSettings | None = None) 
 
 
 def solid_triangles(solid: Any) -> Array:
-    """The triangles ``(F, 3, 3)`` float64 of a ``manifold3d.Manifold``, watertight and turned outwards."""
+    """The triangles ``(F, 3, 3)`` float64 of a ``manifold3d.Manifold``, watertight and turned outwards.
+
+    Example:
+        >>> solid_triangles(random_solid(np.random.default_rng(0))).shape[1:]
+        (3, 3)
+    """
     mesh = solid.to_mesh64()
     triangles: Array = np.asarray(mesh.vert_properties, dtype=np.float64)[:, :3][np.asarray(mesh.tri_verts)]
     return triangles

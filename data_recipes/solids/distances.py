@@ -30,7 +30,12 @@ def total(terms: Iterable[Array]) -> Array:
 
 
 def extrude(plane: Array, axial: Array, half: float) -> Array:
-    """A plane figure's distances ``(...)`` extruded along an axis: ``axial (...)`` runs from -half to half."""
+    """A plane figure's distances ``(...)`` extruded along an axis: ``axial (...)`` runs from -half to half.
+
+    Example:
+        >>> extrude(np.array([-1.0, 3.0]), np.array([0.0, 6.0]), 2.0).tolist()
+        [-1.0, 5.0]
+    """
     over = np.abs(axial) - half
     outside = np.sqrt(np.maximum(plane, 0.0) ** 2 + np.maximum(over, 0.0) ** 2)
     result: Array = outside + np.minimum(np.maximum(plane, over), 0.0)
@@ -45,7 +50,12 @@ def corner(offsets: list[Array]) -> Array:
 
 
 def wedge(u: Array, v: Array, angle: float) -> Array:
-    """Plane angle of ``angle`` radians, in (0, pi), around the positive u axis."""
+    """Plane angle of ``angle`` radians, in (0, pi), around the positive u axis.
+
+    Example:
+        >>> wedge(np.array([1.0]), np.array([-1.0]), np.pi / 2).round(3).tolist()
+        [0.0]
+    """
     cosine, sine = np.cos(angle / 2), np.sin(angle / 2)
     height = np.abs(v)
     along = np.maximum(u * cosine + height * sine, 0.0)
@@ -59,6 +69,10 @@ def ellipsoid(positions: Array, radii: ArrayLike) -> Array:
 
     The nearest point is ``r_i^2 p_i / (t + r_i^2)`` with ``|(r_i p_i / (t + r_i^2))_i| = 1``; t by Newton's method on
     the reciprocal of that norm, which is almost straight (Hebden's trick), started below the root.
+
+    Example:
+        >>> ellipsoid(np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]]), [0.5, 0.5, 0.5]).round(6).tolist()
+        [-0.5, 1.5]
     """
     axes = np.asarray(radii, dtype=np.float64)[:, None]
     squares = axes**2
@@ -96,7 +110,12 @@ def _edge_blocks(points: Array, coordinate: Array) -> Iterator[tuple[Array, Arra
 
 
 def polyline(coordinates: list[Array], points: Array) -> Array:
-    """Unsigned distance to the segments between consecutive ``points (n >= 2, D)``; D coordinates ``(...)``."""
+    """Unsigned distance to the segments between consecutive ``points (n >= 2, D)``; D coordinates ``(...)``.
+
+    Example:
+        >>> polyline([np.array([0.5]), np.array([2.0])], np.array([[0.0, 0.0], [1.0, 0.0]])).tolist()
+        [2.0]
+    """
     nearest: Array = np.full(coordinates[0].shape, np.inf)
     for start, end in _edge_blocks(points, coordinates[0]):
         axis = end - start
@@ -110,7 +129,13 @@ def polyline(coordinates: list[Array], points: Array) -> Array:
 
 
 def polygon(u: Array, v: Array, points: Array) -> Array:
-    """Closed simple polygon ``points (n, 2)``; a point is inside when a ray from it crosses oddly many edges."""
+    """Closed simple polygon ``points (n, 2)``; a point is inside when a ray from it crosses oddly many edges.
+
+    Example:
+        >>> square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+        >>> polygon(np.array([0.0, 3.0]), np.array([0.0, 0.0]), square).tolist()
+        [-1.0, 2.0]
+    """
     closed = np.concatenate([points, points[:1]])
     inside = np.zeros(u.shape, dtype=bool)
     for (u0, v0), (u1, v1) in _edge_blocks(closed, u):

@@ -6,6 +6,11 @@ A family is ``(rng) -> solid`` and a solid maps ``positions (N, 3)`` to signed d
 No value exceeds the true distance by more than a few percent, so that a solid which is far from a cube can be
 left out. Every proportion and every count is log-uniform over the range written beside it; what has no
 natural zero (angles of placement, phases, offsets) is uniform.
+
+Example:
+    >>> solid = FAMILIES["ball"](np.random.default_rng(0))
+    >>> (solid(np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])) < 0).tolist()
+    [True, False]
 """
 
 from __future__ import annotations

@@ -74,6 +74,11 @@ def occupancy_density_fn(occupancy_fn: Callable[[Array], Array], *, pitch: float
 
     Raises:
         ValueError: (when asked) probabilities outside [0, 1] or NaN.
+
+    Example:
+        >>> field = occupancy_density_fn(lambda positions: np.array([0.0, 0.5, 1.0]), pitch=0.1)
+        >>> field(np.zeros((3, 3))).round(2).tolist()
+        [0.0, 6.93, 69.08]
     """
     if not 0.0 < pitch < np.inf:
         raise ValueError(f"occupancy_density_fn: pitch must be finite and > 0, got {pitch}")
@@ -134,6 +139,11 @@ def summed_density_fn(density_fns: Sequence[DensityFn]) -> DensityFn:
     """The sum of fields in the same coordinates, ``positions (..., 3) -> (...)``: an object put into a scene.
 
     Densities add: the light that passes is the product of what each lets pass.
+
+    Example:
+        >>> field = summed_density_fn([lambda p: np.ones((len(p), 1)), lambda p: p[:, :1]])
+        >>> field(np.array([[2.0, 0.0, 0.0]])).ravel().tolist()
+        [3.0]
     """
     parts = list(density_fns)
     if not parts:

@@ -59,6 +59,14 @@ def load_grid(path: str | Path) -> tuple[NDArray[np.float32], NDArray[np.float64
     Raises:
         FileNotFoundError: no such file.
         ValueError: not an ``.npz`` file, an array missing or of the wrong shape, an impossible box.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     save_grid(Path(folder, "room.npz"), np.ones((4, 4, 2)), [[0, 0, 0], [2, 2, 1]])
+        ...     density, box = load_grid(Path(folder, "room.npz"))
+        >>> density.shape, box.tolist()
+        ((4, 4, 2), [[0.0, 0.0, 0.0], [2.0, 2.0, 1.0]])
     """
     source = Path(path)
     try:
@@ -80,7 +88,16 @@ def load_grid(path: str | Path) -> tuple[NDArray[np.float32], NDArray[np.float64
 
 
 def save_grid(path: str | Path, density: NDArray[Any], aabb: ArrayLike) -> None:
-    """Write what :func:`load_grid` reads; whole or not at all."""
+    """Write what :func:`load_grid` reads; whole or not at all.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     save_grid(Path(folder, "room.npz"), np.ones((4, 4, 2)), [[0, 0, 0], [2, 2, 1]])
+        ...     density, box = load_grid(Path(folder, "room.npz"))
+        >>> density.shape, box.tolist()
+        ((4, 4, 2), [[0.0, 0.0, 0.0], [2.0, 2.0, 1.0]])
+    """
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
     partial = target.with_name(target.name + ".partial")

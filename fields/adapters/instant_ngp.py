@@ -32,7 +32,12 @@ GRID_KEY = ("snapshot", "density_grid_binary")
 
 
 def morton_index(resolution: int = CELLS) -> NDArray[np.int64]:
-    """Place in Morton order of every cell ``[x, y, z]``, ``(R, R, R)``; ``resolution`` is a power of two."""
+    """Place in Morton order of every cell ``[x, y, z]``, ``(R, R, R)``; ``resolution`` is a power of two.
+
+    Example:
+        >>> morton_index(2).ravel().tolist()  # of the cells 000, 001, .., 111 of xyz
+        [0, 4, 2, 6, 1, 5, 3, 7]
+    """
     if resolution < 1 or resolution & (resolution - 1):
         raise ValueError(f"morton_index: resolution must be a power of two, got {resolution}")
     axis = np.arange(resolution, dtype=np.int64)

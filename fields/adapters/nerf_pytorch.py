@@ -264,6 +264,11 @@ def ndc_from_world(
 
     Raises:
         ValueError: a position that is not before the camera.
+
+    Example:
+        >>> positions = np.array([[0.5, 0.0, -1.0], [0.0, 0.0, -1e9]])
+        >>> ndc_from_world(positions, focal=8.0, width=16, height=12).round(3).tolist()
+        [[0.5, 0.0, -1.0], [0.0, 0.0, 1.0]]
     """
     points = np.asarray(positions, dtype=np.float64)
     x, y, z = np.moveaxis(points, -1, 0)

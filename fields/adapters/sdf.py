@@ -47,6 +47,11 @@ def logistic_density(distance: Array, *, sharpness: float) -> Array:
 
     Returns:
         ``(...)`` of the same kind, in [0, sharpness].
+
+    Example:
+        >>> import numpy as np
+        >>> logistic_density(np.array([-1.0, 0.0, 1.0]), sharpness=4.0).round(3).tolist()
+        [3.928, 2.0, 0.072]
     """
     _positive("logistic_density", sharpness=sharpness)
     xp = namespace(distance)

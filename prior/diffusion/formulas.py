@@ -29,6 +29,10 @@ def kept_share(timestep: Tensor, like: Tensor) -> Tensor:
     Raises:
         TypeError: timesteps that are not integers.
         ValueError: timesteps outside [-1, 1000), or not one for each cube.
+
+    Example:
+        >>> kept_share(torch.tensor([-1, 999]), torch.zeros(2, 3)).flatten().round(decimals=4).tolist()
+        [1.0, 0.0]
     """
     if timestep.is_floating_point() or timestep.dtype == torch.bool:
         raise TypeError(f"kept_share: timestep must be an integer, got dtype {timestep.dtype}")
@@ -48,6 +52,11 @@ def q_sample(x0: Tensor, timestep: Tensor, noise: Tensor) -> Tensor:
         x0: ``(N, ...)``, signed occupancy in the prior's use.
         timestep: ``(N,)`` in [0, 1000).
         noise: standard normal, of x0's shape.
+
+    Example:
+        >>> x0, noise = torch.ones(1, 4), torch.zeros(1, 4)
+        >>> [round(float(q_sample(x0, torch.tensor([t]), noise)[0, 0]), 3) for t in (0, 50, 999)]
+        [0.999, 0.933, 0.0]
     """
     _same_shape("q_sample", x0=x0, noise=noise)
     kept = kept_share(timestep, x0)
@@ -63,6 +72,11 @@ def q_flip(x0: Tensor, timestep: Tensor, uniform: Tensor) -> Tensor:
         x0: ``(N, ...)`` in [-1, 1].
         timestep: ``(N,)`` in [0, 1000).
         uniform: uniform in [0, 1), of x0's shape.
+
+    Example:
+        >>> x0, uniform = torch.ones(1, 4), torch.tensor([[0.0, 0.4, 0.6, 0.999]])
+        >>> q_flip(x0, torch.tensor([999]), uniform).tolist()
+        [[1.0, 1.0, -1.0, -1.0]]
     """
     _same_shape("q_flip", x0=x0, uniform=uniform)
     chance = (1.0 + kept_share(timestep, x0).to(x0.dtype) * x0) / 2.0
@@ -75,6 +89,11 @@ def x0_from_epsilon(xt: Tensor, timestep: Tensor, epsilon: Tensor, *, clamp: boo
 
     The quotient magnifies an error of ``epsilon`` by ``sqrt((1 - a) / a)``: 0.04 at t = 0, 0.4 at 50, 31 at 500, 5e5 at
     999. So at the last timesteps an unclamped value means nothing and the clamped one is little more than a sign.
+
+    Example:
+        >>> x0, noise, timestep = torch.tensor([[1.0, -1.0]]), torch.tensor([[0.3, -2.0]]), torch.tensor([50])
+        >>> x0_from_epsilon(q_sample(x0, timestep, noise), timestep, noise).round(decimals=5).tolist()
+        [[1.0, -1.0]]
     """
     _same_shape("x0_from_epsilon", xt=xt, epsilon=epsilon)
     kept = kept_share(timestep, xt)
@@ -83,7 +102,13 @@ def x0_from_epsilon(xt: Tensor, timestep: Tensor, epsilon: Tensor, *, clamp: boo
 
 
 def epsilon_from_x0(xt: Tensor, timestep: Tensor, x0: Tensor) -> Tensor:
-    """The noise that leads from ``x0`` to ``xt``: ``(xt - sqrt(a) x0) / sqrt(1 - a)``; inverse of x0_from_epsilon."""
+    """The noise that leads from ``x0`` to ``xt``: ``(xt - sqrt(a) x0) / sqrt(1 - a)``; inverse of x0_from_epsilon.
+
+    Example:
+        >>> x0, noise, timestep = torch.tensor([[1.0, -1.0]]), torch.tensor([[0.5, -2.0]]), torch.tensor([50])
+        >>> epsilon_from_x0(q_sample(x0, timestep, noise), timestep, x0).round(decimals=4).tolist()
+        [[0.5, -2.0]]
+    """
     _same_shape("epsilon_from_x0", xt=xt, x0=x0)
     kept = kept_share(timestep, xt)
     return (xt - kept.sqrt().to(xt.dtype) * x0) / (1.0 - kept).sqrt().to(xt.dtype)
@@ -104,6 +129,12 @@ def gaussian_posterior(xt: Tensor, x0: Tensor, timestep: Tensor, previous: Tenso
 
     Returns:
         Mean of xt's shape; variance ``(N, 1, ...)``. At ``previous = -1``: x0 and 0.
+
+    Example:
+        >>> xt, x0 = torch.zeros(1, 2), torch.ones(1, 2)
+        >>> mean, variance = gaussian_posterior(xt, x0, torch.tensor([10]), torch.tensor([-1]))
+        >>> mean.tolist(), variance.tolist()
+        ([[1.0, 1.0]], [[0.0]])
     """
     _same_shape("gaussian_posterior", xt=xt, x0=x0)
     _check_order(previous, timestep, "gaussian_posterior")
@@ -126,6 +157,11 @@ def bernoulli_posterior(xt: Tensor, x0_pred: Tensor, timestep: Tensor, previous:
         x0_pred: the posterior mean ``E[x0 | x_t]`` in [-1, 1], of xt's shape.
         timestep: ``(N,)`` in [0, 1000).
         previous: ``(N,)`` in [-1, timestep); at -1 the result is ``(1 + x0_pred) / 2``.
+
+    Example:
+        >>> xt, x0_pred = torch.tensor([[1.0, -1.0]]), torch.tensor([[0.5, 0.5]])
+        >>> bernoulli_posterior(xt, x0_pred, torch.tensor([10]), torch.tensor([-1])).tolist()
+        [[0.75, 0.75]]
     """
     _same_shape("bernoulli_posterior", xt=xt, x0_pred=x0_pred)
     _check_order(previous, timestep, "bernoulli_posterior")
@@ -145,6 +181,11 @@ def clean_cubes(labels: Tensor) -> Tensor:
 
     Surface is +1; free voxels and those labelled "ignore" are -1: a generative model has to say something of each
     voxel, and what nobody could see is not counted as surface. The corruption in the pair plays no part.
+
+    Example:
+        >>> labels = torch.tensor([0, 1, 2, 0, 0, 0, 0, 1], dtype=torch.uint8).view(1, 2, 2, 2)  # free, surface, ignore
+        >>> clean_cubes(labels).flatten().tolist()
+        [-1.0, 1.0, -1.0, -1.0, -1.0, -1.0, -1.0, 1.0]
     """
     x0: Tensor = signed_from_occupancy(labels == SURFACE_LABEL)[:, None]
     return x0

@@ -48,6 +48,11 @@ class DiffusionConfig:
         shortcut: of the epsilon objective, see the module's docstring; None for yes with the compact network and no
             with the U-Net. The others do not have the choice.
         kind: tells this from other networks in a file; always ``"diffusion"``.
+
+    Example:
+        >>> from unghost.prior.networks.restoration import SIZES
+        >>> DiffusionConfig("epsilon", SIZES["xs"]).channels
+        ('signed_opacity',)
     """
 
     objective: Objective
@@ -91,7 +96,17 @@ class DiffusionConfig:
 
 
 class DiffusionNet(nn.Module):
-    """A backbone and what it predicts; as a denoiser it takes its input for ``xt`` as it stands."""
+    """A backbone and what it predicts; as a denoiser it takes its input for ``xt`` as it stands.
+
+    Example:
+        >>> from unghost.prior.networks.restoration import SIZES
+        >>> network = DiffusionNet(DiffusionConfig("x0", SIZES["xs"])).eval()
+        >>> x0, timestep = torch.full((1, 1, 32, 32, 32), -1.0), torch.tensor([50])
+        >>> xt = network.noised(x0, timestep, torch.zeros_like(x0))
+        >>> with torch.no_grad():
+        ...     network(xt, timestep, torch.tensor([0.1])).shape
+        torch.Size([1, 1, 32, 32, 32])
+    """
 
     log_odds: Tensor
 

@@ -24,6 +24,16 @@ class NoisedDenoiser:
 
     Raises:
         ValueError: a denoiser of another family, which adds no noise in its training.
+
+    Example:
+        >>> from unghost.core.manifest import Manifest
+        >>> from unghost.prior.diffusion.model import DiffusionConfig
+        >>> from unghost.prior.networks.restoration import SIZES
+        >>> network = DiffusionNet(DiffusionConfig("x0", SIZES["xs"]))
+        >>> manifest = Manifest(name="example", family="diffusion")
+        >>> noised = NoisedDenoiser(TorchDenoiser(network, manifest), torch.Generator().manual_seed(0))
+        >>> noised(torch.full((1, 1, 32, 32, 32), -1.0), 50, torch.tensor([0.1])).shape
+        torch.Size([1, 1, 32, 32, 32])
     """
 
     kind = "torch"

@@ -20,6 +20,12 @@ def training_draws(index: NDArray[np.int64], *, seed: int, device: torch.device 
 
     Sample i's depend on (seed, i) alone, whatever the batch, and (the normals) on the kind of device, whose generator
     draws them.
+
+    Example:
+        >>> times, normals = training_draws(np.array([3, 7]), seed=0, device="cpu")
+        >>> again, _ = training_draws(np.array([7]), seed=0, device="cpu")
+        >>> normals.shape, bool(times[1] == again[0])
+        (torch.Size([2, 1, 32, 32, 32]), True)
     """
     times, normals = np.empty(len(index), np.int64), []
     shape = (1, *(RESOLUTION,) * 3)
@@ -43,6 +49,15 @@ def diffusion_losses(
         edge_fraction: ``(N,)`` > 0.
         index: ``(N,)`` numbers of the samples.
         seed: of the run.
+
+    Example:
+        >>> from unghost.prior.diffusion.model import DiffusionConfig
+        >>> from unghost.prior.networks.restoration import SIZES
+        >>> network = DiffusionNet(DiffusionConfig("x0", SIZES["xs"]))
+        >>> labels = torch.zeros(1, 32, 32, 32, dtype=torch.uint8)
+        >>> losses = diffusion_losses(network, labels, torch.tensor([0.1]), index=np.array([0]), seed=0)
+        >>> len(losses), bool(losses.isfinite().all())
+        (1, True)
     """
     times, draws = training_draws(index, seed=seed, device=labels.device)
     return network.loss(clean_cubes(labels), times, edge_fraction, draws)

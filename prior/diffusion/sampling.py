@@ -59,6 +59,13 @@ def sample_gaussian(
 
     Returns:
         ``x0`` of that shape, float32: the last mean.
+
+    Example:
+        >>> def denoise(xt, timestep, edge_fraction):
+        ...     return torch.ones_like(xt)  # certain of what x0 is
+        >>> generators = [torch.Generator().manual_seed(0)]
+        >>> sample_gaussian(denoise, (1, 4), torch.tensor([0.1]), generators=generators, steps=5).tolist()
+        [[1.0, 1.0, 1.0, 1.0]]
     """
     _check_batch("sample_gaussian", shape, edge_fraction, generators)
     if not 0.0 <= eta <= 1.0:
@@ -105,6 +112,13 @@ def sample_bernoulli(
 
     Returns:
         ``x0`` of that shape, float32, each voxel -1 or +1, drawn from the last mean.
+
+    Example:
+        >>> def denoise(xt, timestep, edge_fraction):
+        ...     return torch.ones_like(xt)  # certain of what x0 is
+        >>> generators = [torch.Generator().manual_seed(0)]
+        >>> sample_bernoulli(denoise, (1, 4), torch.tensor([0.1]), generators=generators, steps=5).tolist()
+        [[1.0, 1.0, 1.0, 1.0]]
     """
     _check_batch("sample_bernoulli", shape, edge_fraction, generators)
 
@@ -151,6 +165,13 @@ def sample_cubes(
     Raises:
         ValueError: a count or a batch below 1, steps outside [1, 1000], an edge fraction that is not > 0, ``eta`` with
             Bernoulli.
+
+    Example:
+        >>> from unghost.prior.diffusion.model import DiffusionConfig
+        >>> from unghost.prior.networks.restoration import SIZES
+        >>> network = DiffusionNet(DiffusionConfig("x0", SIZES["xs"])).eval()
+        >>> sample_cubes(network, count=1, edge_fraction=0.1, seed=0, steps=2).shape
+        torch.Size([1, 1, 32, 32, 32])
     """
     if count < 1 or batch_size < 1:
         raise ValueError(f"sample_cubes: count and batch_size must be >= 1, got {count} and {batch_size}")

@@ -34,7 +34,13 @@ def context_features(channel: Tensor) -> Tensor:
 
 
 def interpolation() -> tuple[slice, np.ndarray]:
-    """The branch's voxels about the cube, along an axis, and the map ``(those^3, 8^3)`` to the cube's grid."""
+    """The branch's voxels about the cube, along an axis, and the map ``(those^3, 8^3)`` to the cube's grid.
+
+    Example:
+        >>> span, weights = interpolation()
+        >>> weights.shape, bool(np.allclose(weights.sum(axis=0), 1))
+        ((64, 512), True)
+    """
     part, weights = coincident_weights(GRID, GRID)
     return part, np.kron(np.kron(weights, weights), weights).T.copy()
 

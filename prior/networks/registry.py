@@ -25,6 +25,11 @@ def config_from_dict(values: Mapping[str, Any]) -> AnyConfig:
 
     Raises:
         ValueError: unknown kind or keys, or values that the configuration refuses.
+
+    Example:
+        >>> from unghost.prior.networks.restoration import SIZES
+        >>> config_from_dict(SIZES["s"].to_dict()) == SIZES["s"]
+        True
     """
     kind = values.get("kind")
     if kind is None:
@@ -39,6 +44,11 @@ def backbone_from_dict(values: Mapping[str, Any]) -> BackboneConfig:
 
     Raises:
         ValueError: as :func:`config_from_dict`, or ``kind`` is ``"diffusion"``.
+
+    Example:
+        >>> from unghost.prior.networks.restoration import SIZES
+        >>> backbone_from_dict(SIZES["s"].to_dict()) == SIZES["s"]
+        True
     """
     config = config_from_dict(values)
     if isinstance(config, DiffusionConfig):
@@ -47,25 +57,49 @@ def backbone_from_dict(values: Mapping[str, Any]) -> BackboneConfig:
 
 
 def build_network(config: AnyConfig) -> AnyNetwork:
-    """A network with fresh weights from torch's generator."""
+    """A network with fresh weights from torch's generator.
+
+    Example:
+        >>> from unghost.prior.networks.restoration import SIZES
+        >>> type(build_network(SIZES["xs"])).__name__
+        'RestorationNet'
+    """
     if isinstance(config, DiffusionConfig):
         return DiffusionNet(config)
     return UNet(config) if isinstance(config, UNetConfig) else RestorationNet(config)
 
 
 def network_for(objective: str, config: BackboneConfig) -> AnyConfig:
-    """What a run of ``objective`` trains: the backbone itself for ``"restoration"``, else a diffusion on it."""
+    """What a run of ``objective`` trains: the backbone itself for ``"restoration"``, else a diffusion on it.
+
+    Example:
+        >>> from unghost.prior.networks.restoration import SIZES
+        >>> [family(network_for(objective, SIZES["xs"])) for objective in ("restoration", "epsilon")]
+        ['restoration', 'diffusion']
+    """
     if objective == "restoration":
         return config
     return DiffusionConfig(objective, config)  # type: ignore[arg-type]
 
 
 def family(config: AnyConfig) -> str:
-    """The manifest's word for it: ``"diffusion"`` or ``"restoration"``."""
+    """The manifest's word for it: ``"diffusion"`` or ``"restoration"``.
+
+    Example:
+        >>> from unghost.prior.networks.restoration import SIZES
+        >>> family(SIZES["xs"])
+        'restoration'
+    """
     return "diffusion" if isinstance(config, DiffusionConfig) else "restoration"
 
 
 def network_gflop(config: AnyConfig) -> float:
-    """Work for one cube in 10^9 operations (a multiply-add is two)."""
+    """Work for one cube in 10^9 operations (a multiply-add is two).
+
+    Example:
+        >>> from unghost.prior.networks.restoration import SIZES
+        >>> network_gflop(SIZES["xs"]) < network_gflop(SIZES["m"])
+        True
+    """
     backbone = config.network if isinstance(config, DiffusionConfig) else config
     return unet_gflop(backbone) if isinstance(backbone, UNetConfig) else gflop(backbone)

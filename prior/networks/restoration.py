@@ -43,6 +43,10 @@ class NetworkConfig:
         widths: feature channels at 16^3, 8^3 and 4^3; multiples of 8.
         blocks: residual blocks at 8^3 going down, at 4^3, and at 8^3 going up.
         condition_width: hidden units of the conditioning network.
+
+    Example:
+        >>> NetworkConfig(channels=("signed_opacity", "view_count")).channels
+        ('signed_opacity', 'view_count')
     """
 
     channels: tuple[str, ...] = (SIGNED_OPACITY,)
@@ -96,14 +100,25 @@ SIZES: dict[str, NetworkConfig] = {
 
 
 def space_to_depth(grid: Tensor) -> Tensor:
-    """``(N, C, 2a, 2b, 2c)`` to ``(N, 8C, a, b, c)``; channel ``c * 8 + dz * 4 + dy * 2 + dx``."""
+    """``(N, C, 2a, 2b, 2c)`` to ``(N, 8C, a, b, c)``; channel ``c * 8 + dz * 4 + dy * 2 + dx``.
+
+    Example:
+        >>> space_to_depth(torch.zeros(1, 1, 32, 32, 32)).shape
+        torch.Size([1, 8, 16, 16, 16])
+    """
     count, channels, depth, height, width = grid.shape
     parts = grid.reshape(count, channels, depth // 2, 2, height // 2, 2, width // 2, 2)
     return parts.permute(0, 1, 3, 5, 7, 2, 4, 6).reshape(count, channels * 8, depth // 2, height // 2, width // 2)
 
 
 def depth_to_space(grid: Tensor) -> Tensor:
-    """Inverse of :func:`space_to_depth`."""
+    """Inverse of :func:`space_to_depth`.
+
+    Example:
+        >>> cubes = torch.arange(64.0).view(1, 1, 4, 4, 4)
+        >>> bool((depth_to_space(space_to_depth(cubes)) == cubes).all())
+        True
+    """
     count, channels, depth, height, width = grid.shape
     parts = grid.reshape(count, channels // 8, 2, 2, 2, depth, height, width)
     return parts.permute(0, 1, 5, 2, 6, 3, 7, 4).reshape(count, channels // 8, depth * 2, height * 2, width * 2)
@@ -171,7 +186,16 @@ class Upsample(nn.Module):
 
 
 class RestorationNet(nn.Module):
-    """Single-step denoiser with a 16^3, 8^3, 4^3 pyramid; see the module's docstring."""
+    """Single-step denoiser with a 16^3, 8^3, 4^3 pyramid; see the module's docstring.
+
+    Example:
+        >>> network = RestorationNet(SIZES["xs"]).eval()
+        >>> cubes = torch.full((2, 1, 32, 32, 32), -1.0)
+        >>> with torch.no_grad():
+        ...     x0_pred = network(cubes, torch.tensor([300, 300]), torch.full((2,), 0.1))
+        >>> x0_pred.shape, bool(x0_pred.abs().max() <= 1)
+        (torch.Size([2, 1, 32, 32, 32]), True)
+    """
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
@@ -262,12 +286,22 @@ def _check_shapes(channels: Tensor, timestep: Tensor, edge_fraction: Tensor, exp
 
 
 def parameter_count(network: nn.Module) -> int:
-    """Number of weights."""
+    """Number of weights.
+
+    Example:
+        >>> parameter_count(nn.Linear(3, 2))
+        8
+    """
     return sum(parameter.numel() for parameter in network.parameters())
 
 
 def gflop(config: NetworkConfig) -> float:
-    """Convolution work for one cube in 10^9 operations (a multiply-add is two)."""
+    """Convolution work for one cube in 10^9 operations (a multiply-add is two).
+
+    Example:
+        >>> gflop(SIZES["xs"]) < gflop(SIZES["s"])
+        True
+    """
     fine, middle, coarse = config.widths
     down, bottom, up = config.blocks
     work = 16**3 * 27 * fine * (8 * len(config.aligned) + 8)  # stem and head

@@ -14,7 +14,13 @@ BLOCK = 8  # input features of the stem per aligned channel: space-to-depth
 
 
 def can_rewire(old: nn.Module, new: nn.Module) -> bool:
-    """Whether two networks differ in nothing but their channels, and the new one still has the surroundings."""
+    """Whether two networks differ in nothing but their channels, and the new one still has the surroundings.
+
+    Example:
+        >>> from unghost.prior.networks.restoration import SIZES, RestorationNet
+        >>> can_rewire(RestorationNet(SIZES["xs"]), RestorationNet(SIZES["s"]))
+        False
+    """
     if not isinstance(old, RestorationNet) or not isinstance(new, RestorationNet):
         return False
     alike = dataclasses.replace(old.config, channels=new.config.channels) == new.config
@@ -37,6 +43,12 @@ def rewire(old: nn.Module, new: nn.Module) -> None:
 
     Raises:
         ValueError: networks that differ in more than their channels, or surroundings to be done without.
+
+    Example:
+        >>> from unghost.prior.networks.restoration import SIZES, RestorationNet
+        >>> old = RestorationNet(SIZES["xs"])
+        >>> new = RestorationNet(dataclasses.replace(SIZES["xs"], channels=("signed_opacity", "view_count")))
+        >>> rewire(old, new)  # new now answers as old does, whatever its second channel holds
     """
     if not (isinstance(old, RestorationNet) and isinstance(new, RestorationNet) and can_rewire(old, new)):
         told = [getattr(network, "config", type(network).__name__) for network in (old, new)]

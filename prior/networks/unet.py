@@ -44,6 +44,10 @@ class UNetConfig:
         blocks: residual blocks a level in the encoder; the decoder has one more.
         heads: of the attention at the coarsest level.
         groups: of the group norms; divide every width.
+
+    Example:
+        >>> UNetConfig(base_width=16).multipliers
+        (1, 2, 4)
     """
 
     kind: str = KIND
@@ -99,7 +103,12 @@ class UNetConfig:
 
 
 def timestep_features(timestep: Tensor, width: int) -> Tensor:
-    """``(N,)`` to ``(N, width)``: cosines and sines of t at periods from 2 pi to 2 pi 10^4 (Ho et al. 2020)."""
+    """``(N,)`` to ``(N, width)``: cosines and sines of t at periods from 2 pi to 2 pi 10^4 (Ho et al. 2020).
+
+    Example:
+        >>> timestep_features(torch.tensor([0, 999]), 8).shape
+        torch.Size([2, 8])
+    """
     half = width // 2
     rates = torch.exp(-math.log(MAX_PERIOD) * torch.arange(half, device=timestep.device, dtype=torch.float32) / half)
     angles = timestep.float()[:, None] * rates
@@ -203,7 +212,14 @@ class Stage(nn.ModuleList):
 
 
 class UNet(nn.Module):
-    """See the module's docstring; ``encoder`` yields one skip a stage, ``decoder`` takes them back last first."""
+    """See the module's docstring; ``encoder`` yields one skip a stage, ``decoder`` takes them back last first.
+
+    Example:
+        >>> network = UNet(UNetConfig(base_width=8, multipliers=(1, 1, 1))).eval()
+        >>> with torch.no_grad():
+        ...     network(torch.zeros(1, 1, 32, 32, 32), torch.tensor([30]), torch.tensor([0.1])).shape
+        torch.Size([1, 1, 32, 32, 32])
+    """
 
     def __init__(self, config: UNetConfig) -> None:
         super().__init__()

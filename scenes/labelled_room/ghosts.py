@@ -21,7 +21,12 @@ CAMERAS = np.array([[2.3, -2.3, 1.5], [0.2, -2.4, 1.2], [2.4, 0.3, 1.7]])  # whe
 
 
 def sigmoid(values: Any) -> Floats:
-    """Logistic function, float32."""
+    """Logistic function, float32.
+
+    Example:
+        >>> sigmoid(np.array([0.0])).tolist()
+        [0.5]
+    """
     return np.asarray(0.5 * (1.0 + np.tanh(0.5 * values)), dtype=np.float32)
 
 

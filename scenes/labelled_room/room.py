@@ -30,6 +30,13 @@ class Room:
         ghost_kind: int8, -1 where no ghost was put, else an index into ``demo_ghosts.KINDS``.
         distance: signed distance to the true solids, metres.
         color: ``(X, Y, Z, 3)`` in [0, 1].
+
+    Example:
+        >>> density, color = np.zeros((2, 2, 2), np.float32), np.zeros((2, 2, 2, 3), np.float32)
+        >>> density[0], ghost_kind = 50.0, np.full((2, 2, 2), -1, np.int8)
+        >>> room = Room(density, density, ghost_kind, np.ones_like(density), color)
+        >>> int(room.surface(OccupancyRule()).sum())
+        4
     """
 
     true_density: Floats
