@@ -15,7 +15,6 @@ from ..recipe import Recipe
 from .box_tree import BoxTree
 
 Array = NDArray[Any]
-Occupancy = NDArray[np.bool_]
 
 MANIFEST = "manifest.csv"
 _MANIFEST_COLUMNS = ("path", "split", "licence")
