@@ -12,13 +12,11 @@ if TYPE_CHECKING:
     from .crops import sample_mesh_cubes as sample_mesh_cubes
     from .library import Mesh as Mesh
     from .library import read_manifest as read_manifest
-    from .voxels import voxelize_triangles_slowly as voxelize_triangles_slowly
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
         ".crops": ["choose_frame", "cut_cubes", "sample_mesh_cubes"],
         ".library": ["Mesh", "read_manifest"],
-        ".voxels": ["voxelize_triangles_slowly"],
     },
 )
