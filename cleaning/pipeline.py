@@ -27,7 +27,6 @@ from .post_processing import decide, removed_regions
 from .queries import CHUNK, Backend, make_query
 from .sliding_window import Progress, grow, shrink, vote
 
-Mask = NDArray[np.bool_]
 FloatGrid = NDArray[np.float32]
 
 DEFAULT_RESOLUTION = 128

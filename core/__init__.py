@@ -55,7 +55,6 @@ if TYPE_CHECKING:
     from .lattice import lattice_axes as lattice_axes
     from .lattice import lattice_origin as lattice_origin
     from .lattice import look_up_cells as look_up_cells
-    from .lazy import attach as attach
     from .manifest import METADATA_KEY as METADATA_KEY
     from .manifest import Denoiser as Denoiser
     from .manifest import Manifest as Manifest
@@ -119,7 +118,6 @@ __getattr__, __dir__, __all__ = attach(
         ".frames": ["CubeFrame", "RESOLUTION", "cube_lattices", "random_rotations", "unit_lattice"],
         ".interpolate": ["corner_weights", "interpolate_grid", "lower_nodes", "trilinear_corners"],
         ".lattice": ["cell_centers", "cell_pitch", "cells_within", "lattice_axes", "lattice_origin", "look_up_cells"],
-        ".lazy": ["attach"],
         ".manifest": ["Denoiser", "METADATA_KEY", "Manifest"],
         ".metrics": ["METRICS", "Metric", "format_value", "get_metric"],
         ".occupancy": [

@@ -13,25 +13,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..core.ply_types import PLY_TYPES
+
 MOST_HEADER = 1 << 16
-_TYPES = {
-    "char": "i1",
-    "int8": "i1",
-    "uchar": "u1",
-    "uint8": "u1",
-    "short": "i2",
-    "int16": "i2",
-    "ushort": "u2",
-    "uint16": "u2",
-    "int": "i4",
-    "int32": "i4",
-    "uint": "u4",
-    "uint32": "u4",
-    "float": "f4",
-    "float32": "f4",
-    "double": "f8",
-    "float64": "f8",
-}
 MOST_EXTENT = 1e30
 _NEEDED = ("x", "y", "z", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
 KEEP_SCORE = "keep_score"
@@ -205,8 +189,8 @@ def _layout(lines: tuple[str, ...]) -> tuple[int, np.dtype[np.void]]:
             order = "<"
         elif words[0] == "element" and len(words) == 3 and words[1] == "vertex" and words[2].isdecimal() and count < 0:
             count = int(words[2])
-        elif words[0] == "property" and len(words) == 3 and words[1] in _TYPES and count >= 0 and len(fields) < 512:
-            fields.append((words[2], f"<{_TYPES[words[1]]}"))
+        elif words[0] == "property" and len(words) == 3 and words[1] in PLY_TYPES and count >= 0 and len(fields) < 512:
+            fields.append((words[2], f"<{PLY_TYPES[words[1]]}"))
         else:
             raise ValueError(
                 f"the header's line {line[:60]!r} (wanted: binary_little_endian, one element, plain numbers)"

@@ -111,11 +111,6 @@ def union(distances: Sequence[Distances]) -> Distances:
     return np.minimum.reduce(list(distances))
 
 
-def intersection(distances: Sequence[Distances]) -> Distances:
-    """Bound outside, exact inside."""
-    return np.maximum.reduce(list(distances))
-
-
 def difference(solid: Distances, cut: Distances) -> Distances:
     """Bound: ``solid`` without ``cut``."""
     return np.maximum(solid, -cut)

@@ -11,14 +11,12 @@ if TYPE_CHECKING:
     from .labels import Truth as Truth
     from .run import harvest as harvest
     from .run import harvest_cubes as harvest_cubes
-    from .run import harvest_scene as harvest_scene
-    from .run import room_scene as room_scene
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
         ".config": ["HarvestConfig"],
         ".labels": ["Truth"],
-        ".run": ["harvest", "harvest_cubes", "harvest_scene", "room_scene"],
+        ".run": ["harvest", "harvest_cubes"],
     },
 )

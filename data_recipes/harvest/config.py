@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 KINDS = ("dense", "hash", "mlp")  # of field, as fields.kinds has them
-HELD_OUT_KINDS = ("mlp",)  # never in a harvest for training
 
 
 @dataclass(frozen=True)

@@ -11,17 +11,12 @@ if TYPE_CHECKING:
     from .crops import cut_cubes as cut_cubes
     from .crops import sample_mesh_cubes as sample_mesh_cubes
     from .library import Mesh as Mesh
-    from .library import MeshEntry as MeshEntry
     from .library import read_manifest as read_manifest
-    from .library import sample_mesh_cube as sample_mesh_cube
-    from .library import select_meshes as select_meshes
-    from .voxels import voxelize_triangles_slowly as voxelize_triangles_slowly
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
         ".crops": ["choose_frame", "cut_cubes", "sample_mesh_cubes"],
-        ".library": ["Mesh", "MeshEntry", "read_manifest", "sample_mesh_cube", "select_meshes"],
-        ".voxels": ["voxelize_triangles_slowly"],
+        ".library": ["Mesh", "read_manifest"],
     },
 )

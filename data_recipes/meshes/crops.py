@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,6 @@ from .voxels import voxelize_batch
 if TYPE_CHECKING:
     from .library import Mesh
 
-Array = NDArray[Any]
 Occupancy = NDArray[np.bool_]
 
 _BEYOND = 1.8  # longer than the diagonal of a box of longest side 1

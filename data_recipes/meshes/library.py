@@ -11,13 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.frames import CubeFrame
 from ..recipe import Recipe
 from .box_tree import BoxTree
-from .crops import cut_cubes, sample_mesh_cubes
 
 Array = NDArray[Any]
-Occupancy = NDArray[np.bool_]
 
 MANIFEST = "manifest.csv"
 _MANIFEST_COLUMNS = ("path", "split", "licence")
@@ -71,11 +68,6 @@ class Mesh:
         a, b, c = self.triangles[row]
         root, along = np.sqrt(rng.random()), rng.random()
         return (1 - root) * a + root * (1 - along) * b + root * along * c, self.normals[row]
-
-    def voxelize(self, frame: CubeFrame) -> Occupancy:
-        """Exact occupancy ``(32, 32, 32)`` of the surface in a cube."""
-        occupancy: Occupancy = cut_cubes(self, [frame])[0]
-        return occupancy
 
 
 @dataclass(frozen=True)
@@ -137,14 +129,3 @@ def select_meshes(recipe: Recipe, mesh_root: str | Path) -> list[MeshEntry]:
             f"and a format of {list(recipe.formats)}"
         )
     return entries
-
-
-def sample_mesh_cube(rng: np.random.Generator, mesh: Mesh, recipe: Recipe) -> tuple[Occupancy, CubeFrame, float]:
-    """One clean cube of a mesh, see :func:`crops.sample_mesh_cubes`.
-
-    Returns:
-        ``occupancy (32, 32, 32)`` bool; the cube in the mesh's (normalised) coordinates; its edge over the
-        mesh's longest side.
-    """
-    occupancy, (frame,) = sample_mesh_cubes([rng], mesh, recipe)
-    return occupancy[0], frame, frame.edge_length

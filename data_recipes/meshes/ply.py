@@ -12,26 +12,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ...core.ply_types import PLY_TYPES
 from .reading import Array, MeshRejected, triangulate
 
-_TYPES = {
-    "char": "i1",
-    "int8": "i1",
-    "uchar": "u1",
-    "uint8": "u1",
-    "short": "i2",
-    "int16": "i2",
-    "ushort": "u2",
-    "uint16": "u2",
-    "int": "i4",
-    "int32": "i4",
-    "uint": "u4",
-    "uint32": "u4",
-    "float": "f4",
-    "float32": "f4",
-    "double": "f8",
-    "float64": "f8",
-}
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _MOST_PROPERTIES = 256
 
@@ -87,11 +70,11 @@ def _add_property(element: _Element, words: list[str]) -> bool:
     """Whether the words are a property that could be added."""
     if not words or any(p.name == words[-1] for p in element.properties) or len(element.properties) >= _MOST_PROPERTIES:
         return False
-    if len(words) == 2 and words[0] in _TYPES:
-        element.properties.append(_Property(words[1], _TYPES[words[0]]))
+    if len(words) == 2 and words[0] in PLY_TYPES:
+        element.properties.append(_Property(words[1], PLY_TYPES[words[0]]))
         return True
-    if len(words) == 4 and words[0] == "list" and words[2] in _TYPES and _TYPES.get(words[1], "f")[0] in "iu":
-        element.properties.append(_Property(words[3], _TYPES[words[2]], _TYPES[words[1]]))
+    if len(words) == 4 and words[0] == "list" and words[2] in PLY_TYPES and PLY_TYPES.get(words[1], "f")[0] in "iu":
+        element.properties.append(_Property(words[3], PLY_TYPES[words[2]], PLY_TYPES[words[1]]))
         return True
     return False
 

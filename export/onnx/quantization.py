@@ -30,7 +30,6 @@ from .parity import ParityInputs, check_inputs, compare, parity_inputs, session_
 
 QUANTISED = ("Conv", "Add", "LeakyRelu", "Relu", "Pad", "Gather", "Reshape")  # operators that int8 may run through
 MOVING = ("Pad", "Gather", "Reshape")  # of these, the ones that only move values
-INT8_OPERATORS = frozenset(("QuantizeLinear", "DequantizeLinear"))  # what int8 adds to graph.OPERATORS
 HALF_LEAST = 64  # smaller tensors stay float32: nothing to gain
 CALIBRATION_BATCH = 8
 PRE_PROCESSED = ("onnx.quant.pre_process", "onnxruntime.quant")  # onnxruntime's mark for a model that needs no tidying

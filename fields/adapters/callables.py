@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -133,27 +133,3 @@ def transformed_density_fn(density_fn: DensityFn, transform: ArrayLike) -> Densi
         return density_fn(place) * factor
 
     return moved
-
-
-def summed_density_fn(density_fns: Sequence[DensityFn]) -> DensityFn:
-    """The sum of fields in the same coordinates, ``positions (..., 3) -> (...)``: an object put into a scene.
-
-    Densities add: the light that passes is the product of what each lets pass.
-
-    Example:
-        >>> field = summed_density_fn([lambda p: np.ones((len(p), 1)), lambda p: p[:, :1]])
-        >>> field(np.array([[2.0, 0.0, 0.0]])).ravel().tolist()
-        [3.0]
-    """
-    parts = list(density_fns)
-    if not parts:
-        raise ValueError("summed_density_fn: density_fns must hold at least one field")
-
-    def density_fn(positions: Array) -> Array:
-        flat = [check_density_shape(part(positions), positions, caller="summed_density_fn") for part in parts]
-        total = flat[0]
-        for other in flat[1:]:
-            total = total + other
-        return total
-
-    return density_fn

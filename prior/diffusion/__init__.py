@@ -10,8 +10,6 @@ if TYPE_CHECKING:
     from .formulas import bernoulli_posterior as bernoulli_posterior
     from .formulas import clean_cubes as clean_cubes
     from .formulas import epsilon_from_x0 as epsilon_from_x0
-    from .formulas import gaussian_posterior as gaussian_posterior
-    from .formulas import kept_share as kept_share
     from .formulas import q_flip as q_flip
     from .formulas import q_sample as q_sample
     from .formulas import x0_from_epsilon as x0_from_epsilon
@@ -27,8 +25,6 @@ __getattr__, __dir__, __all__ = attach(
             "bernoulli_posterior",
             "clean_cubes",
             "epsilon_from_x0",
-            "gaussian_posterior",
-            "kept_share",
             "q_flip",
             "q_sample",
             "x0_from_epsilon",

@@ -119,33 +119,6 @@ def _check_order(previous: Tensor, timestep: Tensor, caller: str) -> None:
         raise ValueError(f"{caller}: previous must be < timestep, which must be >= 0")
 
 
-def gaussian_posterior(xt: Tensor, x0: Tensor, timestep: Tensor, previous: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and variance of ``q(x_s | x_t, x_0)``, ``s = previous < t`` (Ho et al. 2020, eq. 6 and 7, for any stride).
-
-    Args:
-        xt, x0: ``(N, ...)``.
-        timestep: ``(N,)`` in [0, 1000).
-        previous: ``(N,)`` in [-1, timestep).
-
-    Returns:
-        Mean of xt's shape; variance ``(N, 1, ...)``. At ``previous = -1``: x0 and 0.
-
-    Example:
-        >>> xt, x0 = torch.zeros(1, 2), torch.ones(1, 2)
-        >>> mean, variance = gaussian_posterior(xt, x0, torch.tensor([10]), torch.tensor([-1]))
-        >>> mean.tolist(), variance.tolist()
-        ([[1.0, 1.0]], [[0.0]])
-    """
-    _same_shape("gaussian_posterior", xt=xt, x0=x0)
-    _check_order(previous, timestep, "gaussian_posterior")
-    late, early = kept_share(timestep, xt), kept_share(previous, xt)
-    between = late / early  # kept from s to t
-    mean_x0 = early.sqrt() * (1.0 - between) / (1.0 - late)
-    mean_xt = between.sqrt() * (1.0 - early) / (1.0 - late)
-    variance = (1.0 - between) * (1.0 - early) / (1.0 - late)
-    return mean_x0.to(xt.dtype) * x0 + mean_xt.to(xt.dtype) * xt, variance.to(xt.dtype)
-
-
 def bernoulli_posterior(xt: Tensor, x0_pred: Tensor, timestep: Tensor, previous: Tensor) -> Tensor:
     """``P(x_s = +1 | x_t)``, ``s = previous < t``, for bits whose x0 is +1 with probability ``(1 + x0_pred) / 2``.
 

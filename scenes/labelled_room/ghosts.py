@@ -38,10 +38,6 @@ def smooth_noise(rng: np.random.Generator, shape: tuple[int, ...], cells: float)
     return np.asarray((noise - noise.mean()) / noise.std(), dtype=np.float32)
 
 
-def _sigmoid(values: Floats) -> Floats:
-    return np.asarray(0.5 * (1.0 + np.tanh(0.5 * values)), dtype=np.float32)
-
-
 def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 

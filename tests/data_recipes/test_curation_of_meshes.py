@@ -11,6 +11,7 @@ from unghost.core.occupancy import SURFACE_LABEL
 from unghost.core.shards.packing import dequantize_signed, unpack_frame, unpack_labels
 from unghost.core.shards.storage import read_shard
 from unghost.data_recipes.curation import SampleError, curate, sample_pair
+from unghost.data_recipes.meshes.crops import cut_cubes
 from unghost.data_recipes.meshes.files import load_mesh
 from unghost.data_recipes.meshes.library import Mesh
 from unghost.data_recipes.recipe import load_recipe
@@ -52,7 +53,7 @@ def test_a_cube_can_be_cut_again_from_its_frame(tmp_path, mesh_root, mesh_recipe
     for cube, numbers, fraction, source in zip(labels, shard.frames, shard.edge_fraction, shard.source):
         frame = unpack_frame(numbers)
         mesh = load_mesh(mesh_root / shard.provenance["sources"][source]["path"])
-        np.testing.assert_array_equal(mesh.voxelize(frame), cube == SURFACE_LABEL)
+        np.testing.assert_array_equal(cut_cubes(mesh, [frame])[0], cube == SURFACE_LABEL)
         assert np.float32(frame.edge_length) == fraction
         filled += bool((cube == SURFACE_LABEL).any())
     assert filled > 6
@@ -140,4 +141,4 @@ def test_a_recipe_can_have_its_meshes_repaired(tmp_path, mesh_root, mesh_recipe)
         whole = Mesh.from_triangles(ball.vertices[faces])
         for packed, numbers in zip(shard.labels, shard.frames):
             cube = unpack_labels(np.array(packed[None]))[0] == SURFACE_LABEL
-            np.testing.assert_array_equal(whole.voxelize(unpack_frame(numbers)), cube)
+            np.testing.assert_array_equal(cut_cubes(whole, [unpack_frame(numbers)])[0], cube)

@@ -9,13 +9,12 @@ from ..core.lazy import attach
 if TYPE_CHECKING:
     from .run import Outcome as Outcome
     from .run import run_demo as run_demo
-    from .run import run_methods as run_methods
     from .run import score as score
     from .run import summary_table as summary_table
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
-        ".run": ["Outcome", "run_demo", "run_methods", "score", "summary_table"],
+        ".run": ["Outcome", "run_demo", "score", "summary_table"],
     },
 )

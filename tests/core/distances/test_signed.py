@@ -16,7 +16,6 @@ SOLIDS = {  # name: (distance, exact everywhere)
     "cone": (lambda p: sd.cone(p, 0.5, 0.8), True),
     "polyline_tube": (lambda p: sd.polyline_tube(p, np.array([[-0.5, 0, 0], [0, 0.4, 0], [0.4, 0, 0.5]]), 0.15), False),
     "union": (lambda p: sd.union([sd.sphere(p, 0.4), sd.box(p, (0.7, 0.2, 0.2))]), False),
-    "intersection": (lambda p: sd.intersection([sd.sphere(p, 0.6), sd.box(p, (0.5, 0.5, 0.5))]), False),
     "difference": (lambda p: sd.difference(sd.box(p, (0.6, 0.6, 0.6)), sd.sphere(p, 0.7)), False),
     "shell": (lambda p: sd.shell(sd.sphere(p, 0.6), 0.2), True),
     "smooth_union": (lambda p: sd.smooth_union(sd.sphere(p, 0.4), sd.box(p, (0.7, 0.2, 0.2)), 0.2), False),

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from unghost.core.frames import CubeFrame
+from unghost.data_recipes.meshes.crops import sample_mesh_cubes
 from unghost.data_recipes.meshes.files import load_mesh
-from unghost.data_recipes.meshes.library import Mesh, sample_mesh_cube, select_meshes
+from unghost.data_recipes.meshes.library import Mesh, select_meshes
 from unghost.data_recipes.meshes.sources import MeshLibrary
 from unghost.data_recipes.meshes.voxels import voxelize_triangles
 from unghost.data_recipes.recipe import load_recipe
@@ -17,6 +18,12 @@ RECIPE = load_recipe("meshes")
 SHARED = Path(__file__).resolve().parents[3].parent / "shared" / "data"
 needs_shared = pytest.mark.skipif(not SHARED.exists(), reason="no data folder beside the project")
 SQUARE = np.array([[[0, 0, 0], [2, 0, 0], [2, 2, 0]], [[0, 0, 0], [2, 2, 0], [0, 2, 0]]], dtype=float)
+
+
+def sample_mesh_cube(seed, mesh, recipe):
+    """One clean cube of a mesh, and its frame."""
+    occupancy, (frame,) = sample_mesh_cubes([np.random.default_rng(seed)], mesh, recipe)
+    return occupancy[0], frame
 
 
 @pytest.fixture
@@ -71,9 +78,7 @@ def test_leaving_far_triangles_out_changes_nothing():
     rng = np.random.default_rng(0)
     mesh = Mesh.from_triangles(rng.uniform(-1, 1, size=(200, 1, 3)) + rng.normal(size=(200, 3, 3)) * 0.1)
     for i in range(10):
-        occupancy, frame, _ = sample_mesh_cube(
-            np.random.default_rng(i), mesh, dataclasses.replace(RECIPE, max_dilation=0)
-        )
+        occupancy, frame = sample_mesh_cube(i, mesh, dataclasses.replace(RECIPE, max_dilation=0))
         np.testing.assert_array_equal(occupancy, voxelize_triangles(frame.to_local(mesh.triangles)))
 
 
@@ -84,9 +89,8 @@ def test_frame_and_cube_agree():
     points = np.array([mesh.surface_point(rng)[0] for _ in range(3000)])
     seen = 0
     for i in range(20):
-        occupancy, frame, fraction = sample_mesh_cube(np.random.default_rng(i), mesh, RECIPE)
+        occupancy, frame = sample_mesh_cube(i, mesh, RECIPE)
         assert isinstance(frame, CubeFrame)
-        assert frame.edge_length == fraction
         index = frame.voxel_index(points)
         index = index[((index >= 0) & (index < 32)).all(axis=1)]
         assert occupancy[tuple(index.T)].all()
@@ -97,9 +101,7 @@ def test_frame_and_cube_agree():
 def test_empty_cubes_are_empty():
     mesh = Mesh.from_triangles(SQUARE)
     for i in range(20):
-        assert not sample_mesh_cube(np.random.default_rng(i), mesh, dataclasses.replace(RECIPE, empty_share=1.0))[
-            0
-        ].any()
+        assert not sample_mesh_cube(i, mesh, dataclasses.replace(RECIPE, empty_share=1.0))[0].any()
 
 
 def test_node_transforms_are_applied(tmp_path):
@@ -201,5 +203,5 @@ def test_real_meshes_load_and_give_cubes():
     entries = select_meshes(dataclasses.replace(RECIPE, split="val"), SHARED / "meshes")
     for entry in entries[::11]:
         mesh = load_mesh(entry.path)
-        cubes = [sample_mesh_cube(np.random.default_rng(i), mesh, RECIPE)[0] for i in range(8)]
+        cubes = [sample_mesh_cube(i, mesh, RECIPE)[0] for i in range(8)]
         assert sum(occupancy.any() for occupancy in cubes) >= 5

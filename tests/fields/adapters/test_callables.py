@@ -10,7 +10,6 @@ from unghost.core.occupancy import opacity_from_density
 from unghost.fields.adapters.callables import (
     numpy_density_fn,
     occupancy_density_fn,
-    summed_density_fn,
     transformed_density_fn,
 )
 
@@ -112,14 +111,6 @@ def test_transformed_tensors():
 def test_no_similarity(wrong):
     with pytest.raises(ValueError, match="transformed_density_fn: transform must be a"):
         transformed_density_fn(abs, wrong)
-
-
-def test_sum():
-    total = summed_density_fn([lambda p: p[..., 0], lambda p: 2 * p[..., 1:2]])
-    assert total(np.array([[1.0, 10.0, 0.0]])).tolist() == [21.0]
-    assert total(torch.tensor([[[1.0, 10.0, 0.0]]])).tolist() == [[21.0]]
-    with pytest.raises(ValueError, match="at least one"):
-        summed_density_fn([])
 
 
 @pytest.mark.parametrize(

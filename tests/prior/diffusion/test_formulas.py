@@ -11,7 +11,6 @@ from unghost.prior.diffusion.formulas import (
     bernoulli_posterior,
     clean_cubes,
     epsilon_from_x0,
-    gaussian_posterior,
     kept_share,
     q_flip,
     q_sample,
@@ -99,42 +98,6 @@ def test_x0_is_clamped_where_noise_is_magnified():
     assert x0_from_epsilon(xt, at(999), wrong).tolist() == [[1.0, -1.0]]
 
 
-@pytest.mark.parametrize(("late", "early"), [(1, 0), (40, 39), (400, 150), (999, 998), (999, 0)])
-def test_gaussian_posterior_is_bayes_on_a_grid(late, early):
-    """q(x_s | x_t, x_0) normalised numerically: q(x_t | x_s) q(x_s | x_0) over a fine grid of x_s."""
-    kept = alphas_cumprod()
-    between, x0 = kept[late] / kept[early], 0.8
-    xt = math.sqrt(kept[late]) * x0 - 1.3 * math.sqrt(1 - kept[late])
-    spread = math.sqrt(1 - kept[early])
-    grid = np.linspace(math.sqrt(kept[early]) * x0 - 9 * spread, math.sqrt(kept[early]) * x0 + 9 * spread, 200_001)
-    log = -((xt - math.sqrt(between) * grid) ** 2) / (2 * (1 - between))
-    log -= (grid - math.sqrt(kept[early]) * x0) ** 2 / (2 * (1 - kept[early]))
-    weight = np.exp(log - log.max())
-    weight /= weight.sum()
-    mean = (weight * grid).sum()
-    found, variance = gaussian_posterior(
-        torch.tensor([[xt]], dtype=torch.float64), torch.tensor([[x0]], dtype=torch.float64), at(late), at(early)
-    )
-    assert found.item() == pytest.approx(mean, abs=1e-6)
-    assert variance.item() == pytest.approx((weight * (grid - mean) ** 2).sum(), rel=1e-4)
-
-
-def test_gaussian_posterior_at_the_end_is_x0():
-    mean, variance = gaussian_posterior(torch.tensor([[3.0]]), torch.tensor([[0.25]]), at(17), at(-1))
-    assert mean.item() == 0.25
-    assert variance.item() == 0.0
-
-
-def test_published_posterior_of_one_step():
-    """Ho et al. 2020, eq. 7, written out for t = 300."""
-    a, b = alphas_cumprod(), betas()
-    x0, xt = 0.4, 1.2
-    mean = math.sqrt(a[299]) * b[300] / (1 - a[300]) * x0 + math.sqrt(1 - b[300]) * (1 - a[299]) / (1 - a[300]) * xt
-    found, variance = gaussian_posterior(torch.tensor([[xt]]), torch.tensor([[x0]]), at(300), at(299))
-    assert found.item() == pytest.approx(mean, abs=1e-6)
-    assert variance.item() == pytest.approx((1 - a[299]) / (1 - a[300]) * b[300], rel=1e-5)
-
-
 @pytest.mark.parametrize(("late", "early"), [(1, 0), (40, 39), (400, 150), (999, 998), (999, 0), (25, -1)])
 @pytest.mark.parametrize("xt", [-1.0, 1.0])
 def test_bernoulli_posterior_by_enumeration(late, early, xt):
@@ -157,13 +120,12 @@ def test_bernoulli_posterior_by_enumeration(late, early, xt):
     assert found.item() == pytest.approx(expected, abs=1e-9)
 
 
-def test_posteriors_want_an_earlier_time():
+def test_the_posterior_wants_an_earlier_time():
     cube = torch.zeros(1, 2)
-    for function in (gaussian_posterior, bernoulli_posterior):
-        with pytest.raises(ValueError, match="previous must be < timestep"):
-            function(cube, cube, at(5), at(5))
-        with pytest.raises(ValueError, match="must have the shape of xt"):
-            function(cube, torch.zeros(1, 3), at(5), at(4))
+    with pytest.raises(ValueError, match="previous must be < timestep"):
+        bernoulli_posterior(cube, cube, at(5), at(5))
+    with pytest.raises(ValueError, match="must have the shape of xt"):
+        bernoulli_posterior(cube, torch.zeros(1, 3), at(5), at(4))
 
 
 def test_clean_cubes_take_what_is_ignored_for_empty():
@@ -181,5 +143,4 @@ def test_no_cubes_at_all():
     assert q_sample(none, steps, none).shape == none.shape
     assert q_flip(none, steps, none).shape == none.shape
     assert x0_from_epsilon(none, steps, none).shape == none.shape
-    assert gaussian_posterior(none, none, steps, steps - 1)[0].shape == none.shape
     assert bernoulli_posterior(none, none, steps, steps - 1).shape == none.shape
