@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+
+from unghost.core.io import write_text
 
 DIGITS = 5  # tables print means with 3 decimals: no number of theirs changes
 
@@ -29,11 +30,7 @@ def write_lines(path: str | Path, results: Mapping[str, Any]) -> None:
         ValueError: a number is NaN or infinite, which JSON does not have.
     """
     parts = [f" {json.dumps(key)}: {_value(value)}" for key, value in results.items()]
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    partial = target.with_name(target.name + ".partial")
-    partial.write_text("{\n" + ",\n".join(parts) + "\n}\n", encoding="utf-8")
-    os.replace(partial, target)
+    write_text(path, "{\n" + ",\n".join(parts) + "\n}\n")
 
 
 def _value(value: Any) -> str:

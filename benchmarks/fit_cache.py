@@ -5,16 +5,16 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 
 import unghost.fields
+from unghost.core.io import atomic_file, write_bytes, write_text
 from unghost.fields.radiance import RadianceConfig, RadianceField
 
 from .progress import say
@@ -77,12 +77,9 @@ class FitCache:
             say(f"    from the cache{stale}")
             return field, record
         record = {**fit(field), "code": code_hash(unghost.fields)}
-        partial = path.with_suffix(".partial")
-        save_file({entry: value.detach().contiguous() for entry, value in field.state_dict().items()}, partial)
-        os.replace(partial, path)
+        write_bytes(path, save({entry: value.detach().contiguous() for entry, value in field.state_dict().items()}))
         record["sha256"] = file_hash(path)
-        partial.write_text(json.dumps(record), encoding="utf-8")
-        os.replace(partial, note)
+        write_text(note, json.dumps(record))
         return field, record
 
     def views(self, name: str, key: dict[str, Any], make: Callable[[], Views]) -> Views:
@@ -92,8 +89,6 @@ class FitCache:
             with np.load(path) as stored:
                 return dict(stored)
         made = make()
-        partial = path.with_suffix(".partial")
-        with partial.open("wb") as stream:
+        with atomic_file(path) as stream:
             np.savez(stream, **made)  # type: ignore[arg-type]
-        os.replace(partial, path)
         return made

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -16,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core.aabb import as_aabb
 from ..core.arrays import is_tensor, to_numpy
+from ..core.io import write_npz
 from ..core.lattice import cells_within, lattice_axes, lattice_origin, look_up_cells
 from ..core.occupancy import check_density_shape
 
@@ -145,7 +145,6 @@ class KeepMask:
 
     def save(self, path: str | Path) -> None:
         """Write ``.npz`` without pickles: ``manifest`` (JSON) and ``cells`` (bits, C order); whole or not at all."""
-        target = Path(path)
         manifest = {
             "format": FORMAT,
             "format_version": FORMAT_VERSION,
@@ -154,14 +153,8 @@ class KeepMask:
             "shape": list(self.cells.shape),
             "details": self.details,
         }
-        partial = target.with_name(target.name + ".partial")
-        try:
-            with partial.open("wb") as stream:
-                text = np.frombuffer(json.dumps(manifest, allow_nan=False).encode(), dtype=np.uint8)
-                np.savez_compressed(stream, manifest=text, cells=np.packbits(self.cells))
-            os.replace(partial, target)
-        finally:
-            partial.unlink(missing_ok=True)
+        text = np.frombuffer(json.dumps(manifest, allow_nan=False).encode(), dtype=np.uint8)
+        write_npz(path, parents=False, manifest=text, cells=np.packbits(self.cells))
 
     @classmethod
     def load(cls, path: str | Path) -> KeepMask:

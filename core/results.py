@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.metadata
-import json
 import os
 import platform
 import subprocess
@@ -13,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from .io import write_json
 
 REPORTED_PACKAGES = ("numpy", "onnxruntime", "torch", "scipy", "scikit-image", "open3d-cpu", "trimesh")
 
@@ -74,12 +75,8 @@ def build_results(
 
 
 def write_results(path: str | Path, results: Mapping[str, Any]) -> None:
-    """Write atomically: a reader sees the old file or the whole new one."""
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    partial = target.with_name(target.name + ".partial")
-    partial.write_text(json.dumps(results, indent=1, sort_keys=False, allow_nan=False) + "\n", encoding="utf-8")
-    os.replace(partial, target)
+    """Write a results file atomically (:func:`unghost.core.io.write_json`)."""
+    write_json(path, results)
 
 
 def json_ready(value: Any) -> Any:

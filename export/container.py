@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import os
 from pathlib import Path
 
+from ..core.io import write_bytes
 from ..core.manifest import METADATA_KEY, Manifest
 
 PRECISIONS = ("fp32", "fp16", "int8")
@@ -55,14 +55,7 @@ def seal(body: bytes, manifest: Manifest) -> bytes:
 
 def write_sealed(path: str | Path, body: bytes, manifest: Manifest) -> None:
     """Write :func:`seal` to a file, whole or not at all."""
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    partial = target.with_name(target.name + ".partial")
-    with partial.open("wb") as stream:
-        stream.write(seal(body, manifest))
-        stream.flush()
-        os.fsync(stream.fileno())
-    os.replace(partial, target)
+    write_bytes(path, seal(body, manifest), fsync=True)
 
 
 def unseal(data: bytes, *, origin: str) -> Manifest:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ..core.channels import with_unknown
+from ..core.io import write_bytes
 from ..core.manifest import METADATA_KEY, Manifest
 from ..core.schedule import TIMESTEPS
 from .networks.registry import AnyNetwork, build_network, config_from_dict
@@ -33,15 +33,8 @@ def write_tensors(path: str | Path, tensors: Mapping[str, Tensor], metadata: Map
         from safetensors.torch import save
     except ImportError:
         raise ImportError("write_tensors: needs safetensors: pip install unghost[torch]") from None
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    partial = target.with_name(target.name + ".partial")
     plain = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
-    with partial.open("wb") as stream:
-        stream.write(_ordered(save(plain, dict(metadata))))
-        stream.flush()
-        os.fsync(stream.fileno())
-    os.replace(partial, target)
+    write_bytes(path, _ordered(save(plain, dict(metadata))), fsync=True)
 
 
 def read_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, str]]:

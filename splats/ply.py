@@ -6,13 +6,13 @@ stay on the disk until they are read: a file of 500,000 splats (124 MB) opens in
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..core.io import atomic_file
 from ..core.ply_types import PLY_TYPES
 
 MOST_HEADER = 1 << 16
@@ -239,23 +239,17 @@ def write_splat_ply(
     fields = [(name, splats.rows.dtype[name]) for name in names]
     if keep_score is not None:
         fields.append((KEEP_SCORE, np.dtype("<f4")))
-    target.parent.mkdir(parents=True, exist_ok=True)
-    partial = target.with_name(target.name + ".partial")
     chosen = np.flatnonzero(keep)
-    try:
-        with partial.open("wb") as stream:
-            stream.write(_header(splats.header, len(chosen), with_score=keep_score is not None))
-            for start in range(0, len(chosen), 1 << 16):
-                part = chosen[start : start + (1 << 16)]
-                rows = np.empty(len(part), np.dtype(fields))
-                for name in names:
-                    rows[name] = splats.rows[name][part]
-                if keep_score is not None:
-                    rows[KEEP_SCORE] = keep_score[part]
-                stream.write(rows.tobytes())
-        os.replace(partial, target)
-    finally:
-        partial.unlink(missing_ok=True)
+    with atomic_file(target) as stream:
+        stream.write(_header(splats.header, len(chosen), with_score=keep_score is not None))
+        for start in range(0, len(chosen), 1 << 16):
+            part = chosen[start : start + (1 << 16)]
+            rows = np.empty(len(part), np.dtype(fields))
+            for name in names:
+                rows[name] = splats.rows[name][part]
+            if keep_score is not None:
+                rows[KEEP_SCORE] = keep_score[part]
+            stream.write(rows.tobytes())
 
 
 def _header(lines: tuple[str, ...], count: int, *, with_score: bool) -> bytes:

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -19,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..frames import RESOLUTION
+from ..io import new_folder, read_json
 from .packing import FRAME_NUMBERS, VOXELS
 
 FORMAT = "unghost-shard"
@@ -162,29 +161,23 @@ def write_shard(
         if array.shape != (count, *shape) or array.dtype != np.dtype(dtype):
             raise ValueError(f"write_shard: {name} must be {dtype} {(count, *shape)}, got {array.dtype} {array.shape}")
     _check_values(arrays, provenance, "write_shard")
-    partial = target.with_name(target.name + ".partial")
     try:
-        shutil.rmtree(partial, ignore_errors=True)
-        partial.mkdir(parents=True)
-        for name in layout:
-            _save(partial / f"{name}.npy", np.ascontiguousarray(arrays[name]))
-        manifest = {
-            "format": FORMAT,
-            "format_version": FORMAT_VERSION,
-            "count": count,
-            "kind": kind,
-            "sha256": {name: _sha256(partial / f"{name}.npy") for name in layout},
-            "provenance": dict(provenance),
-        }
-        (partial / "manifest.json").write_text(json.dumps(manifest, indent=1), encoding="utf-8")
-        os.replace(partial, target)
-    except BaseException as error:
-        shutil.rmtree(partial, ignore_errors=True)
-        if isinstance(error, OSError):
-            raise OSError(
-                error.errno, f"write_shard: cannot write {target} ({error.strerror or error}); nothing of it is left"
-            ) from error
-        raise
+        with new_folder(target, unique=False) as partial:
+            for name in layout:
+                _save(partial / f"{name}.npy", np.ascontiguousarray(arrays[name]))
+            manifest = {
+                "format": FORMAT,
+                "format_version": FORMAT_VERSION,
+                "count": count,
+                "kind": kind,
+                "sha256": {name: _sha256(partial / f"{name}.npy") for name in layout},
+                "provenance": dict(provenance),
+            }
+            (partial / "manifest.json").write_text(json.dumps(manifest, indent=1), encoding="utf-8")
+    except OSError as error:
+        raise OSError(
+            error.errno, f"write_shard: cannot write {target} ({error.strerror or error}); nothing of it is left"
+        ) from error
 
 
 @dataclass(frozen=True)
@@ -215,11 +208,9 @@ class Shard:
 def _read_manifest(source: Path) -> dict[str, Any]:
     """The manifest, its own entries checked."""
     try:
-        manifest = json.loads((source / "manifest.json").read_text(encoding="utf-8"))
-    except (FileNotFoundError, NotADirectoryError):
+        manifest = read_json(source / "manifest.json", caller="read_shard")
+    except FileNotFoundError:
         raise ValueError(f"read_shard: {source} has no manifest.json: not a shard, or unfinished") from None
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ValueError(f"read_shard: {source}/manifest.json is not JSON ({error})") from None
     found = manifest if isinstance(manifest, dict) else {}
     if found.get("format") != FORMAT or found.get("format_version") != FORMAT_VERSION:
         raise ValueError(f"read_shard: {source} is not an {FORMAT} of version {FORMAT_VERSION}")

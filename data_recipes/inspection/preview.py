@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.io import write_text
 from ...core.occupancy import DEFAULT_OPACITY_THRESHOLD, FREE_LABEL, IGNORE_LABEL, SURFACE_LABEL, opacity_from_signed
 from ...core.shards.finding import find_shards
 from ...core.shards.packing import dequantize_signed, unpack_labels
@@ -168,12 +168,5 @@ def write_preview(
         rejected=_rejected([shard for _, shard in shards]),
     )
     target = root.resolve().with_name(f"{root.resolve().name}-preview.html") if out is None else Path(out)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    partial = target.with_name(target.name + ".partial")
-    try:
-        partial.write_text(text, encoding="utf-8")
-        os.replace(partial, target)
-    except OSError:  # a full disk, say
-        partial.unlink(missing_ok=True)
-        raise
+    write_text(target, text)
     return target, facts

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import tempfile
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from ...core.io import new_folder, write_json
 from .frames import Extraction, extract_frames
 from .loading import load_capture
 from .nerfstudio import file_lists, write_splits
-from .new_folder import new_folder
 from .posing import Posing, PosingSettings, Progress, pose_jointly
 from .transforms import write_transforms
 
@@ -94,7 +93,7 @@ def make_capture(
         )
         write_splits(partial / "splits.json", sweeps)
         told = _told(sources, taken, posing, how)
-        (partial / "capture.json").write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+        write_json(partial / "capture.json", told)
     return told
 
 

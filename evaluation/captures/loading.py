@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ...core.cameras import Cameras
 from .colmap import find_model, read_model
 from .splits import Splits, resolve_splits
-from .transforms import read_frames, read_json, read_lens
+from .transforms import read_frames, read_lens, read_object
 
 MISSING = ("error", "drop")
 
@@ -175,7 +175,7 @@ def load_cameras(path: str | Path) -> Cameras:
     file = Path(path) / "transforms.json" if Path(path).is_dir() else Path(path)
     if not file.is_file() and not (Path(path).is_dir() and find_model(Path(path))):
         raise FileNotFoundError(f"load_cameras: no file {file}")
-    meta = read_json(file) if file.is_file() else _source(Path(path))[0]
+    meta = read_object(file) if file.is_file() else _source(Path(path))[0]
     merged, names, poses = read_frames(meta, str(file))
     sizes = {f"{body.get('w')} x {body.get('h')}" for body in merged}
     stated: list[Any] = [merged[0].get("w"), merged[0].get("h")]
@@ -190,7 +190,7 @@ def _source(folder: Path) -> tuple[dict[str, Any], str, Path]:
     """What a folder says of its photos, what to call that in errors, and where the photos' names start from."""
     model = None if (folder / "transforms.json").exists() else find_model(folder)
     if model is None:
-        return read_json(folder / "transforms.json"), "transforms.json", folder
+        return read_object(folder / "transforms.json"), "transforms.json", folder
     places = [folder, *folder.resolve().parents[:2]] if model == folder else [folder]
     root = next((place for place in places if (place / "images").is_dir()), folder)
     prefix = "images/" if (root / "images").is_dir() else ""

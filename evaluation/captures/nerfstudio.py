@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import posixpath
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
@@ -12,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.io import new_folder, write_json
 from .loading import Capture
-from .new_folder import new_folder
 from .transforms import write_transforms
 
 PHOTOS = ("copy", "link")
@@ -26,8 +25,7 @@ def file_lists(train: Sequence[str], evaluation: Sequence[str]) -> dict[str, lis
 
 def write_splits(path: str | Path, sweeps: Mapping[str, Sequence[str]]) -> None:
     """``splits.json``: sweep -> names of its photos."""
-    text = json.dumps({sweep: list(names) for sweep, names in sweeps.items()}, indent=1)
-    Path(path).write_text(text + "\n", encoding="utf-8")
+    write_json(path, {sweep: list(names) for sweep, names in sweeps.items()}, parents=False)
 
 
 def write_nerfstudio(

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .transforms import clean_name, first_twice, read_json
+from .transforms import clean_name, first_twice, read_object
 
 FILE_LISTS = {"train_filenames": "train", "val_filenames": "val", "test_filenames": "test"}
 TRAIN_NAMES, EVAL_NAMES = ("train",), ("eval", "test", "val")  # sweeps that are meant if none is named
@@ -47,9 +47,9 @@ def resolve_splits(
         ValueError: a list that is none or is empty, or names what is in no frame, or in two, or twice.
     """
     if given is not None:
-        named: Mapping[str, Any] = read_json(Path(given)) if isinstance(given, (str, Path)) else given
+        named: Mapping[str, Any] = read_object(Path(given)) if isinstance(given, (str, Path)) else given
     elif (folder / "splits.json").exists():
-        named = read_json(folder / "splits.json")
+        named = read_object(folder / "splits.json")
     else:
         named = {split: meta[key] for key, split in FILE_LISTS.items() if key in meta} or by_name(names)
     position = {name: number for number, name in enumerate(names)}

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import os
 import posixpath
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.cameras import Cameras
+from ...core.io import read_json, write_json
 
 DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
 LENS_KEYS = ("fl_x", "fl_y", "cx", "cy")
@@ -25,18 +24,16 @@ BENDS = {  # camera model -> what may differ from 0 in it
 }
 
 
-def read_json(path: Path) -> dict[str, Any]:
+def read_object(path: Path) -> dict[str, Any]:
     """The object in a JSON file.
 
     Raises:
         ValueError: there is no such file, or it is something else.
     """
     try:
-        value = json.loads(path.read_text(encoding="utf-8"))
+        value = read_json(path, caller="load_capture")
     except FileNotFoundError:
         raise ValueError(f"load_capture: {path.parent} has no {path.name}: not a capture") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"load_capture: {path} is not JSON ({error})") from None
     if not isinstance(value, dict):
         raise ValueError(f"load_capture: {path} must hold an object, got a {type(value).__name__}")
     return value
@@ -157,7 +154,4 @@ def write_transforms(
         **{key: list(files) for key, files in lists.items()},
         "frames": frames,
     }
-    target = Path(path)
-    partial = target.with_name(target.name + ".partial")
-    partial.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    os.replace(partial, target)
+    write_json(path, content, parents=False)

@@ -6,13 +6,12 @@ of it can be read. Two conventions never share a table, a column or a chart.
 
 from __future__ import annotations
 
-import json
 import math
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ...core.io import read_json, write_text
 from ...core.metrics import METRICS
 from ...core.pages import LineChart, Series, Table, line_chart, render
 from ...core.pages.charts import colours_of
@@ -78,11 +77,7 @@ def page_text(results: Mapping[str, Any], pictures: Sequence[ViewPictures] = ())
 
 def write_page(path: str | Path, results: Mapping[str, Any], pictures: Sequence[ViewPictures] = ()) -> None:
     """Write :func:`page_text` atomically."""
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    partial = target.with_name(target.name + ".partial")
-    partial.write_text(page_text(results, pictures), encoding="utf-8")
-    os.replace(partial, target)
+    write_text(path, page_text(results, pictures))
 
 
 def read_results(path: str | Path) -> dict[str, Any]:
@@ -95,10 +90,7 @@ def read_results(path: str | Path) -> dict[str, Any]:
     source = Path(path)
     if not source.is_file():
         raise FileNotFoundError(f"read_results: no file {source}")
-    try:
-        found = json.loads(source.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"read_results: {source} is not JSON ({error})") from None
+    found = read_json(source, caller="read_results")
     rows = found.get("rows") if isinstance(found, dict) else None
     if not isinstance(rows, list) or not rows or not all(isinstance(row, dict) and "method" in row for row in rows):
         raise ValueError(f"read_results: {source} has no rows with a method each (docs/formats.md)")

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
@@ -19,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.cameras import Cameras
+from ...core.io import write_npz
 from ..metrics.checks import Mask
 from ..metrics.geometry import normals_from_depth
 from .conventions import SceneExtent
@@ -101,15 +101,8 @@ class PseudoTruth:
             "sha256": {name: _digest(values) for name, values in arrays.items()},
             "details": dict(self.details),
         }
-        target = Path(path)
-        partial = target.with_name(target.name + ".partial")
-        try:
-            text = np.frombuffer(json.dumps(manifest, allow_nan=False).encode(), dtype=np.uint8)
-            with partial.open("wb") as stream:
-                np.savez_compressed(stream, manifest=text, **arrays)
-            os.replace(partial, target)
-        finally:
-            partial.unlink(missing_ok=True)
+        text = np.frombuffer(json.dumps(manifest, allow_nan=False).encode(), dtype=np.uint8)
+        write_npz(path, parents=False, manifest=text, **arrays)
 
 
 def make_pseudo_truth(

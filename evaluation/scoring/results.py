@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import csv
-import os
+import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from ...core.io import write_bytes
 from ...core.results import build_results, write_results
 from ..report.page import write_page
 from ..report.pictures import PHOTO, ViewPictures, view_pictures, worst_first
@@ -175,12 +176,11 @@ def _restored(row: Row, keys: Sequence[str]) -> dict[str, float | None]:
 def _write_views(path: Path, rows: Sequence[Row]) -> None:
     """A line a view and method; an empty cell where a metric is undefined, inf where a render equals its photo."""
     keys = [key for key in rows[0]["per_image"][0] if key not in ("name", "pixels", "infinite")]
-    partial = path.with_name(path.name + ".partial")
-    with partial.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream)
-        writer.writerow(["method", "convention", "view", "pixels", *keys])
-        for row in rows:
-            for each in row["per_image"]:
-                values = ["inf" if key in each["infinite"] else each[key] for key in keys]
-                writer.writerow([row["method"], row["convention"], each["name"], each["pixels"], *values])
-    os.replace(partial, path)
+    stream = io.StringIO(newline="")
+    writer = csv.writer(stream)
+    writer.writerow(["method", "convention", "view", "pixels", *keys])
+    for row in rows:
+        for each in row["per_image"]:
+            values = ["inf" if key in each["infinite"] else each[key] for key in keys]
+            writer.writerow([row["method"], row["convention"], each["name"], each["pixels"], *values])
+    write_bytes(path, stream.getvalue().encode("utf-8"))

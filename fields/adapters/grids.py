@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...core.aabb import as_aabb
 from ...core.interpolate import interpolate_grid
+from ...core.io import write_npz
 from ...core.lattice import cell_centers as cell_centers
 from ...core.lattice import cell_pitch as cell_pitch
 
@@ -98,12 +98,4 @@ def save_grid(path: str | Path, density: NDArray[Any], aabb: ArrayLike) -> None:
         >>> density.shape, box.tolist()
         ((4, 4, 2), [[0.0, 0.0, 0.0], [2.0, 2.0, 1.0]])
     """
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    partial = target.with_name(target.name + ".partial")
-    try:
-        with partial.open("wb") as stream:
-            np.savez_compressed(stream, density=density, aabb=as_aabb(aabb, caller="save_grid"))
-        os.replace(partial, target)
-    finally:
-        partial.unlink(missing_ok=True)
+    write_npz(path, density=density, aabb=as_aabb(aabb, caller="save_grid"))

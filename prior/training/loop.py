@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ from typing import Any
 
 import torch
 
+from ...core.io import write_text
 from ...core.manifest import Manifest
 from ...core.results import commit, versions
 from ...core.shards.storage import Shard, read_shard
@@ -76,12 +76,6 @@ class _Log:
     def close(self) -> None:
         if self._board is not None:
             self._board.close()
-
-
-def _write_text(path: Path, text: str) -> None:
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(text + "\n", encoding="utf-8")
-    os.replace(partial, path)
 
 
 def _by_folder(shards: Sequence[tuple[str | Path, float]], lengths: Sequence[int]) -> list[dict[str, Any]]:
@@ -166,7 +160,7 @@ def _finish(
     }
     manifest = _manifest(trainer, training | {"validation": headline}, sum(advised) / len(advised) if advised else 0.0)
     save_model(out / MODEL_FILE, trainer.averaged_network(), manifest)
-    _write_text(out / "validation.json", json.dumps(scores, indent=1))
+    write_text(out / "validation.json", json.dumps(scores, indent=1) + "\n")
     return scores
 
 
@@ -178,7 +172,7 @@ def _prepare(config: TrainConfig, out: Path, resume: bool, group: Group) -> Trai
         raise FileExistsError(f"train: {out} holds a run already; resume it, or name another folder")
     out.mkdir(parents=True, exist_ok=True)
     if group.first:
-        _write_text(out / CONFIG_FILE, config.to_json())
+        write_text(out / CONFIG_FILE, config.to_json() + "\n")
     trainer = Trainer(config, group=group)
     if resume and state.exists():
         trainer.restore(state)

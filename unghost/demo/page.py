@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ..core.io import write_text
 from ..core.metrics import get_metric
 from ..core.pages import Table, render
 from .run import SCORES
@@ -61,7 +61,4 @@ def page_text(results: Mapping[str, Any], pictures: Mapping[str, bytes]) -> str:
 
 def write_page(path: str | Path, results: Mapping[str, Any], pictures: Mapping[str, bytes]) -> None:
     """Write the page atomically; see :func:`page_text`."""
-    target = Path(path)
-    partial = target.with_name(target.name + ".partial")
-    partial.write_text(page_text(results, pictures), encoding="utf-8")
-    os.replace(partial, target)
+    write_text(path, page_text(results, pictures))

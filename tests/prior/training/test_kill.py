@@ -18,15 +18,16 @@ pytestmark = [
     pytest.mark.slow,
 ]
 
-MOMENTS = {  # what is killed, and at which call of it; the last column is the step of the state on disk afterwards
+# What is killed, and at which call of it (the first write is config.json); then the step of the state on disk.
+MOMENTS = {
     "before anything is kept": ("os.fsync", 1, None),
-    "half a checkpoint is written": ("half a write", 3, "2"),
+    "half a checkpoint is written": ("half a write", 4, "2"),
     "a checkpoint is written and not yet in place": ("os.replace", 4, "2"),
     "a checkpoint is just in place": ("os.replace, after", 4, "3"),
     "weights have moved and their average has not": ("average", 4, "3"),
     "half a line of the log is written": ("half a line", 1, None),
     "training is over, nothing is scored": ("validation", 1, "6"),
-    "half of the model is written": ("half a write", 8, "6"),
+    "half of the model is written": ("half a write", 9, "6"),
     "the model is there, its scores are not": ("os.replace", 10, "6"),
 }
 PROGRAM = """
