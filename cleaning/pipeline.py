@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..core.aabb import as_aabb, scene_extent
 from ..core.arrays import is_tensor, to_numpy
 from ..core.cameras import Cameras, warn_if_turned_away
+from ..core.config import override
 from ..core.lattice import lattice_origin, look_up_cells
 from ..core.manifest import Denoiser
 from ..core.occupancy import OccupancyRule
@@ -270,10 +271,7 @@ def judge(
         >>> judgement.score.shape
         (32, 32, 32)
     """
-    known = {item.name for item in dataclasses.fields(CleanSettings)}
-    if set(overrides) - known:
-        raise TypeError(f"clean: unknown settings {sorted(set(overrides) - known)}; known are {sorted(known)}")
-    s = dataclasses.replace(settings or CleanSettings(), **overrides)
+    s = override(settings or CleanSettings(), overrides, caller="clean")
     box = as_aabb(aabb, caller="clean")
     check_denoiser(denoiser, caller="clean")
     warn_if_turned_away(cameras, box, caller="clean")

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from .channels import check_channels
+from .config import from_dict, to_dict
 from .frames import RESOLUTION
 from .schedule import TIMESTEPS
 
@@ -55,7 +56,7 @@ class Manifest:
 
     def to_json(self) -> str:
         """One JSON object, keys sorted."""
-        body = dataclasses.asdict(self) | {"format": FORMAT, "format_version": FORMAT_VERSION}
+        body = to_dict(self) | {"format": FORMAT, "format_version": FORMAT_VERSION}
         return json.dumps(body, sort_keys=True)
 
     @classmethod
@@ -70,13 +71,7 @@ class Manifest:
         version = body.pop("format_version", None)
         if version != FORMAT_VERSION:
             raise ValueError(f"{origin}: manifest version {version!r}, this release reads {FORMAT_VERSION}")
-        known = {item.name for item in dataclasses.fields(cls)}
-        if set(body) - known:
-            raise ValueError(f"{origin}: unknown manifest keys {sorted(set(body) - known)}")
-        try:
-            return cls(**body)
-        except TypeError as error:
-            raise ValueError(f"{origin}: {error}") from None
+        return from_dict(cls, body, caller=origin, what="manifest keys")
 
 
 class Denoiser(Protocol):

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 import sys
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from ..core.config import check_keys, from_dict, nearest, to_dict
 from .solids.primitives import FAMILIES
 
 if sys.version_info >= (3, 11):
@@ -20,13 +20,6 @@ else:
 BUILTIN_FOLDER = Path(__file__).parent / "recipes"
 SOURCES = ("procedural", "meshes", "csg")
 SPLITS = ("train", "val", "test")
-
-
-def _nearest(unknown: Iterable[str], known: Iterable[str]) -> str:
-    """`` (did you mean ...?)`` for names that are almost known ones, else nothing."""
-    choices = list(known)
-    near = [match for name in unknown for match in difflib.get_close_matches(name, choices, n=1)]
-    return f" (did you mean {', '.join(near)}?)" if near else ""
 
 
 @dataclass(frozen=True)
@@ -150,15 +143,11 @@ class Recipe:
             raise ValueError(f"Recipe: source must be one of {', '.join(SOURCES)}, got {self.source!r}")
         if self.split not in SPLITS:
             raise ValueError(f"Recipe: split must be one of {', '.join(SPLITS)}, got {self.split!r}")
-        unknown = [name for name in self.families if name not in FAMILIES]
-        if unknown:
-            raise ValueError(
-                f"Recipe: unknown families {unknown}{_nearest(unknown, FAMILIES)}; known: {', '.join(FAMILIES)}"
-            )
+        check_keys(self.families, FAMILIES, caller="Recipe", what="families")
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able, lists instead of tuples; :func:`recipe_from_mapping` reads it back."""
-        return {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
+        return to_dict(self)
 
 
 def recipe_from_mapping(values: Mapping[str, Any]) -> Recipe:
@@ -171,20 +160,7 @@ def recipe_from_mapping(values: Mapping[str, Any]) -> Recipe:
         >>> recipe_from_mapping({"name": "mine", "soft_share": 0.0}).soft_share
         0.0
     """
-    defaults = {field.name: field.default for field in fields(Recipe)}
-    unknown = sorted(set(values) - set(defaults))
-    if unknown:
-        raise ValueError(f"Recipe: unknown keys {unknown}{_nearest(unknown, defaults)}; known: {', '.join(defaults)}")
-    converted: dict[str, Any] = {}
-    for key, value in values.items():
-        wanted = type(defaults[key])
-        given = tuple(value) if isinstance(value, list) else value
-        if wanted is float and isinstance(given, int) and not isinstance(given, bool):
-            given = float(given)
-        if not isinstance(given, wanted) or isinstance(given, bool) != (wanted is bool):
-            raise ValueError(f"Recipe: {key} must be a {wanted.__name__}, got {value!r}")
-        converted[key] = given
-    return Recipe(**converted)
+    return from_dict(Recipe, values)
 
 
 def builtin_recipes() -> list[str]:
@@ -214,7 +190,7 @@ def load_recipe(path_or_name: str | Path) -> Recipe:
         path = BUILTIN_FOLDER / f"{path_or_name}.toml"
     if not path.is_file():
         names = builtin_recipes()
-        hint = _nearest([str(path_or_name)], names)
+        hint = nearest([str(path_or_name)], names)
         raise FileNotFoundError(
             f"load_recipe: {path_or_name} is neither a file nor a built-in recipe{hint} ({', '.join(names)})"
         )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections import Counter
 from collections.abc import Sequence
@@ -10,6 +9,8 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from ..core.config import override
 
 try:
     import torch
@@ -95,12 +96,7 @@ class DensityRegularizer:
         settings: RegularizerSettings | None = None,
         **overrides: Any,
     ) -> None:
-        known = {item.name for item in dataclasses.fields(RegularizerSettings)}
-        if set(overrides) - known:
-            raise TypeError(
-                f"DensityRegularizer: unknown settings {sorted(set(overrides) - known)}; known are {sorted(known)}"
-            )
-        self.settings = dataclasses.replace(settings or RegularizerSettings(), **overrides)
+        self.settings = override(settings or RegularizerSettings(), overrides, caller="DensityRegularizer")
         self.aabb = as_aabb(aabb, caller="DensityRegularizer")
         self.denoiser = check_denoiser(denoiser, caller="DensityRegularizer")
         if field_pitch is not None and not callable(field_pitch) and not 0 < field_pitch < np.inf:

@@ -27,6 +27,7 @@ import unghost.fields
 import unghost.regularizer
 from unghost import load_denoiser
 from unghost.core.cameras import Cameras
+from unghost.core.config import check_keys
 from unghost.core.results import build_results, json_ready, write_results
 from unghost.evaluation.captures.loading import load_capture
 from unghost.evaluation.report.rows import draw_comparison, format_table, mean_over_seeds
@@ -125,9 +126,9 @@ class Options(BenchmarkOptions):
         """``settings`` as keyword arguments."""
         pairs = [text.partition("=") for text in self.settings]
         known = {item.name for item in dataclasses.fields(RegularizerSettings)} - {"seed", "rule"}
-        for (name, sign, _), text in zip(pairs, self.settings):
-            if not sign or name not in known:
-                raise ValueError(f"--settings: {text!r} is not name=value with a name of {', '.join(sorted(known))}")
+        if not all(sign for _, sign, _ in pairs):
+            raise ValueError(f"--settings: must be name=value each, got {self.settings}")
+        check_keys([name for name, _, _ in pairs], sorted(known), caller="--settings", what="names")
         return {name: _literal(value) for name, _, value in pairs}
 
 

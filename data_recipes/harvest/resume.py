@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 from pathlib import Path
 
+from ...core.config import to_dict
 from ...core.shards.storage import read_shard
 from .config import HarvestConfig
 
@@ -33,7 +32,7 @@ def finished(
     told = read_shard(target, verify=True).provenance
     settings = told.get("config") or {}
     wanted = {"recipe": "harvest" if fit else "rooms", "seed": seed, "scene": index}
-    given = {key: value for key, value in json.loads(json.dumps(dataclasses.asdict(config))).items() if key in settings}
+    given = {key: value for key, value in to_dict(config).items() if key in settings}
     differing = [f"{key}: {told.get(key)!r}, not {value!r}" for key, value in wanted.items() if told.get(key) != value]
     differing += [f"{key}: {settings[key]!r}, not {value!r}" for key, value in given.items() if settings[key] != value]
     if told.get("meshes") and not meshes:

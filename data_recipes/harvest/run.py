@@ -7,7 +7,6 @@ Each is stored with its surroundings, its frame, and how many photos saw each vo
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 
 from ...core.aabb import scene_extent
 from ...core.channels import full_channel
+from ...core.config import to_dict
 from ...core.frames import RESOLUTION, cube_lattices, random_rotations
 from ...core.occupancy import DEFAULT_OPACITY_THRESHOLD, opacity_from_density, opacity_from_signed
 from ...core.shards.packing import (
@@ -214,7 +214,7 @@ def harvest_scene(
         "resolution": resolution,
         "field_pitch": field.field_pitch,
         "psnr": round(float(report["psnr"]), 3),
-        "config": dataclasses.asdict(config),
+        "config": to_dict(config),
         "licence": " AND ".join(sorted({"generated", *(mesh["licence"] for mesh in meshes)})),
         "meshes": meshes,
     }
@@ -231,7 +231,7 @@ def room_scene(
     objects, meshes = draw_objects_of(seed, index, config, mesh_root)
     arrays = room_cubes(rng, random_scene(rng, objects), config)
     arrays["group"] = np.full(config.cubes, index, dtype=np.int32)
-    provenance: dict[str, Any] = {"recipe": "rooms", "seed": seed, "scene": index, "config": dataclasses.asdict(config)}
+    provenance: dict[str, Any] = {"recipe": "rooms", "seed": seed, "scene": index, "config": to_dict(config)}
     licences = sorted({"generated", *(mesh["licence"] for mesh in meshes)})
     return arrays, provenance | {"licence": " AND ".join(licences), "meshes": meshes}
 

@@ -18,7 +18,6 @@ A bit that is flipped with probability ``f`` says ``log((1 - f) / f) xt`` about 
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -27,6 +26,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from ...core.config import from_dict, to_dict
 from ...core.occupancy import EMPTY, OCCUPIED
 from ...core.schedule import flip_log_odds
 from ..networks.restoration import NetworkConfig, RestorationNet
@@ -80,19 +80,18 @@ class DiffusionConfig:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able."""
-        return dataclasses.asdict(self)
+        return to_dict(self)
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> DiffusionConfig:
         """Inverse of :meth:`to_dict`; unknown keys are refused."""
-        known = {item.name for item in dataclasses.fields(cls)}
-        if set(values) - known:
-            raise ValueError(f"DiffusionConfig: unknown keys {sorted(set(values) - known)}, known: {sorted(known)}")
-        network = values.get("network")
-        if not isinstance(network, Mapping):
-            raise ValueError("DiffusionConfig: network must be a table")
-        backbone = UNetConfig if network.get("kind") == UNetConfig.kind else NetworkConfig
-        return cls(**{**values, "network": backbone.from_dict(network)})
+        return from_dict(cls, values, nested={"network": _backbone})
+
+
+def _backbone(values: Any) -> NetworkConfig | UNetConfig:
+    if not isinstance(values, Mapping):
+        raise ValueError("DiffusionConfig: network must be a table")
+    return (UNetConfig if values.get("kind") == UNetConfig.kind else NetworkConfig).from_dict(values)
 
 
 class DiffusionNet(nn.Module):

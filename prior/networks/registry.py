@@ -31,6 +31,8 @@ def config_from_dict(values: Mapping[str, Any]) -> AnyConfig:
         >>> config_from_dict(SIZES["s"].to_dict()) == SIZES["s"]
         True
     """
+    if not isinstance(values, Mapping):
+        raise ValueError(f"config_from_dict: a network must be a table of keys and values, got {values!r:.80}")
     kind = values.get("kind")
     if kind is None:
         return NetworkConfig.from_dict(values)

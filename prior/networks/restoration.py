@@ -11,7 +11,6 @@ The surroundings, where a network has them, do not line up with the cube and ent
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ...core.channels import SIGNED_OPACITY, SURROUNDINGS, check_channels
+from ...core.config import from_dict, to_dict
 from ...core.frames import RESOLUTION
 from ...core.occupancy import opacity_from_signed
 from ...core.schedule import TIMESTEPS
@@ -77,18 +77,13 @@ class NetworkConfig:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able."""
-        return dataclasses.asdict(self)
+        return to_dict(self)
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> NetworkConfig:
         """Inverse of :meth:`to_dict`; unknown keys are refused. ``channels`` may be 1, as it used to be written."""
-        known = {item.name for item in dataclasses.fields(cls)}
-        if set(values) - known:
-            raise ValueError(f"NetworkConfig: unknown keys {sorted(set(values) - known)}, known: {sorted(known)}")
-        body = dict(values)
-        if body.get("channels") == 1:
-            body["channels"] = (SIGNED_OPACITY,)
-        return cls(**body)
+        old = {"channels": (SIGNED_OPACITY,)} if values.get("channels") == 1 else {}
+        return from_dict(cls, {**values, **old})
 
 
 SIZES: dict[str, NetworkConfig] = {

@@ -14,7 +14,6 @@ input of the encoder is joined to it again. What is ours: eight norm groups, and
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -24,6 +23,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from ...core.config import from_dict, to_dict
 from ...core.frames import RESOLUTION
 from .restoration import NetworkConfig
 
@@ -91,15 +91,12 @@ class UNetConfig:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able."""
-        return dataclasses.asdict(self)
+        return to_dict(self)
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> UNetConfig:
         """Inverse of :meth:`to_dict`; unknown keys are refused."""
-        known = {item.name for item in dataclasses.fields(cls)}
-        if set(values) - known:
-            raise ValueError(f"UNetConfig: unknown keys {sorted(set(values) - known)}, known: {sorted(known)}")
-        return cls(**values)
+        return from_dict(cls, values)
 
 
 def timestep_features(timestep: Tensor, width: int) -> Tensor:

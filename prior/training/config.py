@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from ...core.config import from_dict, to_dict
 from ..networks.registry import BackboneConfig, backbone_from_dict, network_for
 from ..networks.restoration import NetworkConfig
 
@@ -108,18 +108,12 @@ class TrainConfig:
 
     def to_json(self) -> str:
         """One JSON object."""
-        return json.dumps(dataclasses.asdict(self), indent=1, sort_keys=True)
+        return json.dumps(to_dict(self), indent=1, sort_keys=True)
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> TrainConfig:
         """From parsed JSON or TOML; unknown keys are refused."""
-        known = {item.name for item in dataclasses.fields(cls)}
-        if set(values) - known:
-            raise ValueError(f"TrainConfig: unknown keys {sorted(set(values) - known)}, known: {sorted(known)}")
-        body = dict(values)
-        if isinstance(body.get("network"), Mapping):
-            body["network"] = backbone_from_dict(body["network"])
-        return cls(**body)
+        return from_dict(cls, values, nested={"network": backbone_from_dict})
 
     def learning_rate_at(self, step: int, progress: float) -> float:
         """Linear warm-up over ``warmup_steps``, then a cosine over ``progress`` in [0, 1] down to ``final_rate``."""

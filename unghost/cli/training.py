@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -53,10 +52,11 @@ def _online(specs: list[str], *, seed: int, workers: int, mesh_root: Path | None
 
 def _configured(file: Path | None, size: str | None, channels: tuple[str, ...], given: dict[str, Any]) -> TrainConfig:
     """The configuration of a file, or the default one, with what the command line says in its place."""
+    from ..core.io import read_json
     from ..prior.networks.restoration import SIZES, NetworkConfig
     from ..prior.training.config import TrainConfig
 
-    base = TrainConfig() if file is None else TrainConfig.from_dict(json.loads(file.read_text(encoding="utf-8")))
+    base = TrainConfig() if file is None else TrainConfig.from_dict(read_json(file, caller="train"))
     if size is not None and size not in SIZES:
         raise ValueError(f"train: --size must be one of {', '.join(SIZES)}, got {size!r}")
     network = base.network if size is None else dataclasses.replace(SIZES[size], channels=base.network.channels)

@@ -144,7 +144,7 @@ def test_bad_options_are_named_before_anything_is_fitted(bench, capture, tmp_pat
         bench.run(_options(bench, capture, tmp_path, eval="mixed"))
     with pytest.raises(ValueError, match="no split 'three'; choose from one, two, mixed"):
         bench.run(_options(bench, capture, tmp_path, eval="three"))
-    with pytest.raises(ValueError, match="'colour=3' is not name=value with a name of "):
+    with pytest.raises(ValueError, match=r"--settings: unknown names \['colour'\]; known: chunk, "):
         bench.run(_options(bench, capture, tmp_path, settings=("colour=3",)))
     (capture / "2.png").unlink()
     with pytest.raises(FileNotFoundError, match=r"2\.png"):
