@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..core.cameras import Cameras
+from ..core.errors import InvalidArgument
 from ..core.interpolate import trilinear_corners
 from ..fields.kinds import TrainableField
 from ..fields.radiance import CONTRACTED, contract
@@ -68,7 +69,7 @@ class DeformationUncertainty:
             threshold: in (0, 1], a share of :attr:`highest`; 1 keeps everything.
         """
         if not 0.0 < threshold <= 1.0:
-            raise ValueError(f"DeformationUncertainty.keep: threshold must lie in (0, 1], got {threshold}")
+            raise InvalidArgument(f"DeformationUncertainty.keep: threshold must lie in (0, 1], got {threshold}")
         return Keep(self, threshold * self.highest + 1e-6)
 
 
@@ -122,7 +123,9 @@ def deformation_uncertainty(
         True
     """
     if level < 1 or rays < 1 or batch < 1:
-        raise ValueError(f"deformation_uncertainty: level, rays and batch must be >= 1, got {level}, {rays}, {batch}")
+        raise InvalidArgument(
+            f"deformation_uncertainty: level, rays and batch must be >= 1, got {level}, {rays}, {batch}"
+        )
     origins, directions, _ = gather_rays(cameras, images)
     generator = torch.Generator().manual_seed(seed)
     rounds = -(-rays // len(origins))

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from ..core.errors import InvalidArgument
 from ..core.manifest import Manifest
 from ..core.occupancy import (
     DEFAULT_OPACITY_THRESHOLD,
@@ -183,7 +184,7 @@ class Classical:
 
     def __init__(self, name: str) -> None:
         if name != "input" and name not in OF_BITS and name not in OF_VALUES:
-            raise ValueError(f"Classical: name must be one of {self.names()}, got {name!r}")
+            raise InvalidArgument(f"Classical: name must be one of {self.names()}, got {name!r}")
         self.manifest = Manifest(name)
 
     @staticmethod

@@ -10,11 +10,13 @@ from __future__ import annotations
 import math
 from typing import Literal
 
+from ..core.errors import InvalidArgument, MissingExtra
+
 try:
     import torch
     from torch import Tensor
 except ImportError as error:  # pragma: no cover - exercised in a subprocess
-    raise ImportError("unghost.baselines.losses needs torch: pip install unghost[torch]") from error
+    raise MissingExtra("unghost.baselines.losses needs torch: pip install unghost[torch]") from error
 
 from ..core.arrays import upcast, widest
 from ..core.ray_distortion import distortion
@@ -43,7 +45,9 @@ def total_variation_loss(grid: Tensor) -> Tensor:
         [3.0]
     """
     if grid.ndim < 3 or min(grid.shape[-3:]) < 2:
-        raise ValueError(f"total_variation_loss: grid must be (..., X, Y, Z) with sides >= 2, got {tuple(grid.shape)}")
+        raise InvalidArgument(
+            f"total_variation_loss: grid must be (..., X, Y, Z) with sides >= 2, got {tuple(grid.shape)}"
+        )
     values = widest(grid)
     here = values[..., :-1, :-1, :-1]
     steps = torch.stack(
@@ -67,7 +71,7 @@ def sparsity_loss(density: Tensor, *, length: float) -> Tensor:
         [0.0, 0.632, 1.0]
     """
     if not (math.isfinite(length) and length > 0):
-        raise ValueError(f"sparsity_loss: length must be finite and > 0, got {length}")
+        raise InvalidArgument(f"sparsity_loss: length must be finite and > 0, got {length}")
     return -torch.expm1(-length * upcast(density))
 
 
@@ -86,7 +90,7 @@ def depth_smoothness_loss(depth: Tensor) -> Tensor:
         [[4.0]]
     """
     if depth.ndim < 2 or min(depth.shape[-2:]) < 2:
-        raise ValueError(f"depth_smoothness_loss: depth must be (..., H, W), sides >= 2, got {tuple(depth.shape)}")
+        raise InvalidArgument(f"depth_smoothness_loss: depth must be (..., H, W), sides >= 2, got {tuple(depth.shape)}")
     endless, values = torch.isinf(depth), widest(depth)
     down = torch.where(endless[..., 1:, :-1] | endless[..., :-1, :-1], 0.0, values.diff(dim=-2)[..., :-1])
     across = torch.where(endless[..., :-1, 1:] | endless[..., :-1, :-1], 0.0, values.diff(dim=-1)[..., :-1, :])
@@ -114,7 +118,7 @@ def distortion_loss(weights: Tensor, edges: Tensor) -> Tensor:
     """
     finite = torch.isfinite(edges)
     if not bool(finite.all()):
-        raise ValueError(
+        raise InvalidArgument(
             f"distortion_loss: edges must be finite (squash distances first), got {int((~finite).sum())} of "
             f"{edges.numel()} that are not; first {edges[~finite][0].item():g}"
         )
@@ -170,14 +174,14 @@ def scale_gradients(values: Tensor, distance: Tensor) -> Tensor:
         [0.0, 0.25, 1.0]
     """
     if values.shape[: distance.ndim] != distance.shape:
-        raise ValueError(
+        raise InvalidArgument(
             f"scale_gradients: values must begin with distance's shape {tuple(distance.shape)}, "
             f"got {tuple(values.shape)}"
         )
     far = upcast(distance.detach())
     valid = far >= 0
     if not bool(valid.all()):
-        raise ValueError(
+        raise InvalidArgument(
             f"scale_gradients: distance must be >= 0, got {int((~valid).sum())} of {far.numel()} that are not; "
             f"first {far[~valid][0].item():g}"
         )
@@ -203,12 +207,12 @@ def squash_density(density: Tensor, *, threshold: float, how: Squash) -> Tensor:
         [-1.0, 0.0, 1.0, 1.0]
     """
     if not (math.isfinite(threshold) and threshold > 0):
-        raise ValueError(f"squash_density: threshold must be finite and > 0, got {threshold}")
+        raise InvalidArgument(f"squash_density: threshold must be finite and > 0, got {threshold}")
     centred = upcast(density) / threshold - 1.0
     if how == "clamp":
         return centred.clamp(-1.0, 1.0)
     if how != "sigmoid":
-        raise ValueError(f'squash_density: how must be "clamp" or "sigmoid", got {how!r}')
+        raise InvalidArgument(f'squash_density: how must be "clamp" or "sigmoid", got {how!r}')
     return torch.tanh(centred * (SIGMOID_SLOPE / 2.0)) / math.tanh(SIGMOID_SLOPE / 2.0)
 
 
@@ -232,11 +236,13 @@ def sds_loss(signed: Tensor, x0_pred: Tensor, *, alpha_cumprod: float | Tensor) 
         0.72
     """
     if x0_pred.shape != signed.shape:
-        raise ValueError(f"sds_loss: x0_pred must have shape {tuple(signed.shape)}, got {tuple(x0_pred.shape)}")
+        raise InvalidArgument(f"sds_loss: x0_pred must have shape {tuple(signed.shape)}, got {tuple(x0_pred.shape)}")
     values = upcast(signed)
     alpha = torch.as_tensor(alpha_cumprod, dtype=values.dtype, device=values.device)
     if tuple(alpha.shape) not in ((), (len(values),)) or not bool(((alpha > 0) & (alpha < 1)).all()):
-        raise ValueError(f"sds_loss: alpha_cumprod must be one or {len(values)} numbers in (0, 1), got {alpha_cumprod}")
+        raise InvalidArgument(
+            f"sds_loss: alpha_cumprod must be one or {len(values)} numbers in (0, 1), got {alpha_cumprod}"
+        )
     weight = torch.sqrt(alpha * (1.0 - alpha))
     weight = weight.reshape(-1, *[1] * (values.ndim - 1)) if weight.ndim else weight
     return 0.5 * weight * (values - x0_pred.detach()) ** 2

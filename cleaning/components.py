@@ -15,6 +15,8 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.errors import InvalidArgument
+
 Mask = NDArray[np.bool_]
 
 
@@ -47,7 +49,7 @@ def label_components(occupied: Mask, *, connectivity: int = 26) -> tuple[NDArray
         (2, [1, 1, 0, 0])
     """
     if connectivity not in (6, 26):
-        raise ValueError(f"label_components: connectivity must be 6 or 26, got {connectivity}")
+        raise InvalidArgument(f"label_components: connectivity must be 6 or 26, got {connectivity}")
     try:
         from scipy import ndimage
     except ImportError:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.arrays import is_tensor, to_numpy
+from ..core.errors import InvalidArgument, InvalidType
 from ..core.manifest import Denoiser
 
 BATCH = 40  # cubes handed to a denoiser at once
@@ -23,9 +24,11 @@ def check_denoiser(denoiser: Denoiser, *, caller: str) -> Denoiser:
         ('signed_opacity',)
     """
     if not callable(denoiser) or not hasattr(denoiser, "manifest"):
-        raise TypeError(f"{caller}: denoiser must be callable and have a manifest, got {type(denoiser).__name__}")
+        raise InvalidType(f"{caller}: denoiser must be callable and have a manifest, got {type(denoiser).__name__}")
     if getattr(denoiser, "kind", None) not in ("numpy", "torch"):
-        raise ValueError(f"{caller}: denoiser.kind must be 'numpy' or 'torch', got {getattr(denoiser, 'kind', None)!r}")
+        raise InvalidArgument(
+            f"{caller}: denoiser.kind must be 'numpy' or 'torch', got {getattr(denoiser, 'kind', None)!r}"
+        )
     return denoiser
 
 
@@ -63,7 +66,7 @@ def run_denoiser(
         pieces.append(_run_one(denoiser, part, timestep, fraction))
         expected = (len(part), 1, *part.shape[2:])
         if tuple(pieces[-1].shape) != expected:
-            raise ValueError(
+            raise InvalidArgument(
                 f"{caller}: denoiser {denoiser.manifest.name!r} must return shape {expected}, "
                 f"got {tuple(pieces[-1].shape)}"
             )
@@ -75,7 +78,7 @@ def run_denoiser(
         result = np.concatenate([to_numpy(piece) for piece in pieces]).astype(np.float32, copy=False)
         finite = bool(np.isfinite(result).all())
     if not finite:
-        raise ValueError(f"{caller}: denoiser {denoiser.manifest.name!r} returned values that are not finite")
+        raise InvalidArgument(f"{caller}: denoiser {denoiser.manifest.name!r} returned values that are not finite")
     return result
 
 

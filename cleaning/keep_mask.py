@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core.aabb import as_aabb
 from ..core.arrays import is_tensor, to_numpy
+from ..core.errors import InvalidArgument, InvalidFile
 from ..core.io import write_npz
 from ..core.lattice import cells_within, lattice_axes, lattice_origin, look_up_cells
 from ..core.occupancy import check_density_shape
@@ -51,11 +52,11 @@ class KeepMask:
     def __post_init__(self) -> None:
         object.__setattr__(self, "aabb", as_aabb(self.aabb, caller="KeepMask"))
         if not (np.isfinite(self.pitch) and self.pitch > 0):
-            raise ValueError(f"KeepMask: pitch must be finite and > 0, got {self.pitch}")
+            raise InvalidArgument(f"KeepMask: pitch must be finite and > 0, got {self.pitch}")
         sides = self.aabb[1] - self.aabb[0]
         covered = np.array(self.cells.shape[:3]) * self.pitch
         if self.cells.ndim != 3 or self.cells.dtype != np.bool_ or (covered < sides * (1 - 1e-5)).any():
-            raise ValueError(
+            raise InvalidArgument(
                 f"KeepMask: cells must be bool (X, Y, Z) and cover the box, got {self.cells.dtype} "
                 f"{self.cells.shape} of side {self.pitch} for sides {sides.tolist()}"
             )
@@ -79,7 +80,7 @@ class KeepMask:
 
     def _keep(self, positions: NDArray[np.float64]) -> NDArray[np.bool_]:
         if positions.shape[-1:] != (3,):
-            raise ValueError(f"KeepMask.keep: positions must have shape (..., 3), got {positions.shape}")
+            raise InvalidArgument(f"KeepMask.keep: positions must have shape (..., 3), got {positions.shape}")
         return look_up_cells(self.cells, positions, aabb=self.aabb, pitch=self.pitch, outside=True)
 
     def apply(self, density_fn: Callable[[Any], Any]) -> Callable[[Any], Any]:
@@ -109,7 +110,7 @@ class KeepMask:
         Cell-centred; a cell is judged by its centre.
         """
         if values.ndim < 3 or 0 in values.shape[:3]:
-            raise ValueError(f"KeepMask.apply_grid: values must have shape (X, Y, Z, ...), got {values.shape}")
+            raise InvalidArgument(f"KeepMask.apply_grid: values must have shape (X, Y, Z, ...), got {values.shape}")
         axes = [
             low + (np.arange(length) + 0.5) * (high - low) / length
             for low, high, length in zip(self.aabb[0], self.aabb[1], values.shape)
@@ -171,11 +172,11 @@ class KeepMask:
         except FileNotFoundError:
             raise
         except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as error:
-            raise ValueError(f"KeepMask.load: {source} is not a keep mask, or is truncated ({error})") from None
+            raise InvalidFile(f"KeepMask.load: {source} is not a keep mask, or is truncated ({error})") from None
         if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
-            raise ValueError(f"KeepMask.load: {source} is not a keep mask (format must be {FORMAT!r})")
+            raise InvalidFile(f"KeepMask.load: {source} is not a keep mask (format must be {FORMAT!r})")
         if manifest.get("format_version") != FORMAT_VERSION:
-            raise ValueError(
+            raise InvalidFile(
                 f"KeepMask.load: {source} has version {manifest.get('format_version')!r}, "
                 f"this release reads {FORMAT_VERSION}"
             )
@@ -183,8 +184,8 @@ class KeepMask:
             shape = tuple(int(length) for length in manifest["shape"])
             count = int(np.prod(shape))
             if min(shape) < 1 or packed.dtype != np.uint8 or packed.shape != (-(-count // 8),):
-                raise ValueError(f"cells do not fit shape {shape}")
+                raise InvalidFile(f"cells do not fit shape {shape}")
             cells = np.unpackbits(packed, count=count).reshape(shape).astype(bool)
             return cls(np.array(manifest["aabb"]), float(manifest["pitch"]), cells, dict(manifest["details"]))
         except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"KeepMask.load: {source}: {error}") from None
+            raise InvalidFile(f"KeepMask.load: {source}: {error}") from None

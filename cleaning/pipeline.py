@@ -15,6 +15,7 @@ from ..core.aabb import as_aabb, scene_extent
 from ..core.arrays import is_tensor, to_numpy
 from ..core.cameras import Cameras, warn_if_turned_away
 from ..core.config import override
+from ..core.errors import InvalidArgument
 from ..core.lattice import lattice_origin, look_up_cells
 from ..core.manifest import Denoiser
 from ..core.occupancy import OccupancyRule
@@ -106,7 +107,7 @@ class CleanSettings:
         }
         for name, (holds, rule) in rules.items():
             if not holds:
-                raise ValueError(f"clean: {name} must be {rule}, got {getattr(self, name)!r}")
+                raise InvalidArgument(f"clean: {name} must be {rule}, got {getattr(self, name)!r}")
         if self.timestep is not None:
             check_timestep(self.timestep, caller="clean")
         boxes = tuple(as_aabb(box, caller="clean: keep_boxes").tolist() for box in self.keep_boxes)
@@ -306,7 +307,7 @@ def grid_of(aabb: NDArray[np.float64], settings: CleanSettings) -> tuple[float, 
         pitch = settings.field_pitch or float(sides.max()) / DEFAULT_RESOLUTION
     counts = np.maximum(np.ceil(sides / pitch - 1e-4), 1.0)
     if counts.prod() > MOST_CELLS:
-        raise ValueError(
+        raise InvalidArgument(
             f"clean: aabb with sides {sides.tolist()} has {counts.prod():.3g} cells of side {pitch:g}, more than "
             f"{MOST_CELLS}: pass a smaller box, a larger field_pitch, or a resolution"
         )

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.arrays import is_tensor, to_numpy
+from ..core.errors import InvalidArgument, InvalidType, MissingExtra
 from ..core.occupancy import check_density_shape
 
 Backend = Literal["numpy", "torch"]
@@ -58,7 +59,7 @@ def find_backend(density_fn: Callable[[Any], Any], place: NDArray[Any], *, calle
         ValueError: neither works; the message quotes both errors, and the first is chained.
     """
     if not callable(density_fn):
-        raise TypeError(f"{caller}: density_fn must be callable, got {type(density_fn).__name__}")
+        raise InvalidType(f"{caller}: density_fn must be callable, got {type(density_fn).__name__}")
     if _is_torch(density_fn):
         return "torch"
     points = np.asarray(place, dtype=np.float32).reshape(1, 3)
@@ -73,7 +74,7 @@ def find_backend(density_fn: Callable[[Any], Any], place: NDArray[Any], *, calle
         _ask(density_fn, points, "torch")
         return "torch"
     except Exception as second:
-        raise ValueError(
+        raise InvalidArgument(
             f"{caller}: density_fn must accept positions of shape (N, 3); with a numpy array it raised "
             f"{type(first).__name__}: {first}; with a tensor, {type(second).__name__}: {second}"
         ) from first
@@ -106,9 +107,9 @@ def make_query(
         [3.0]
     """
     if backend not in (None, "numpy", "torch"):
-        raise ValueError(f"{caller}: backend must be None, 'numpy' or 'torch', got {backend!r}")
+        raise InvalidArgument(f"{caller}: backend must be None, 'numpy' or 'torch', got {backend!r}")
     if backend == "torch" and "torch" not in sys.modules:
-        raise ImportError(f"{caller}: backend='torch' needs torch: pip install unghost[torch]")
+        raise MissingExtra(f"{caller}: backend='torch' needs torch: pip install unghost[torch]")
     kind = backend or find_backend(density_fn, place, caller=caller)
 
     def query(positions: NDArray[Any]) -> NDArray[np.float64]:
@@ -128,5 +129,5 @@ def _real_numbers(density: Any, *, caller: str) -> NDArray[Any]:
         density = density.detach().double() if density.device.type != "mps" else density.detach().float()
     values = to_numpy(density)
     if values.dtype == np.bool_ or not np.can_cast(values.dtype, np.float64, "same_kind"):
-        raise TypeError(f"{caller}: density_fn must return integers or floating-point numbers, got {values.dtype}")
+        raise InvalidType(f"{caller}: density_fn must return integers or floating-point numbers, got {values.dtype}")
     return values

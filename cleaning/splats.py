@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.errors import InvalidArgument
 from ..core.manifest import Denoiser
 from ..splats.density import SplatField
 from ..splats.ply import Gaussians, read_splat_ply, write_splat_ply
@@ -115,9 +116,9 @@ def clean_splats(
         ((200,), True)
     """
     if resolution is not None and resolution < 8:
-        raise ValueError(f"clean_splats: resolution must be >= 8, got {resolution}")
+        raise InvalidArgument(f"clean_splats: resolution must be >= 8, got {resolution}")
     if not 1.0 <= reach < np.inf:
-        raise ValueError(f"clean_splats: reach must be finite and >= 1, got {reach}")
+        raise InvalidArgument(f"clean_splats: reach must be finite and >= 1, got {reach}")
     aabb = box_of(gaussians, reach=reach)
     pitch = pitch_of(gaussians, aabb, resolution) if mask is None else mask.pitch
     field = SplatField(gaussians, pitch=pitch)
@@ -140,7 +141,7 @@ def clean_ply(source: Path, target: Path | None, *, scores_only: bool = False, *
     """
     splats = read_splat_ply(source)
     if target is not None and target.exists() and target.samefile(source):
-        raise ValueError(f"clean: {target} is the file to clean; write to another")
+        raise InvalidArgument(f"clean: {target} is the file to clean; write to another")
     found = clean_splats(splats.gaussians(), **options)
     if target is not None:
         write_splat_ply(target, splats, keep=found.keep | scores_only, keep_score=found.keep_score)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..core.errors import InvalidArgument
 from .keep_mask import KeepMask
 from .pipeline import Judgement
 
@@ -56,14 +57,16 @@ def choose_strength(
     """
     tried = sorted(set(map(float, strengths)))
     if not tried or not all(0.0 <= strength <= 1.0 for strength in tried):
-        raise ValueError(f"choose_strength: strengths must be one or more numbers in [0, 1], got {list(strengths)}")
+        raise InvalidArgument(
+            f"choose_strength: strengths must be one or more numbers in [0, 1], got {list(strengths)}"
+        )
     if not 0.0 <= tolerance < np.inf:
-        raise ValueError(f"choose_strength: tolerance must be finite and >= 0, got {tolerance}")
+        raise InvalidArgument(f"choose_strength: tolerance must be finite and >= 0, got {tolerance}")
     errors: dict[float, float] = {}
     for strength in tried:
         found = float(error(judgement.mask(strength)))
         if not 0.0 <= found < np.inf:
-            raise ValueError(f"choose_strength: error must give finite numbers >= 0, got {found} at {strength:g}")
+            raise InvalidArgument(f"choose_strength: error must give finite numbers >= 0, got {found} at {strength:g}")
         errors[strength] = found
     allowed = min(errors.values()) * (1.0 + tolerance)
     best = max(strength for strength, found in errors.items() if found <= allowed)

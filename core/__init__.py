@@ -40,6 +40,17 @@ if TYPE_CHECKING:
     from .channels import stack_channels as stack_channels
     from .channels import surroundings_lattice as surroundings_lattice
     from .channels import with_unknown as with_unknown
+    from .config import check_keys as check_keys
+    from .config import from_dict as from_dict
+    from .config import nearest as nearest
+    from .config import override as override
+    from .config import to_dict as to_dict
+    from .errors import InvalidArgument as InvalidArgument
+    from .errors import InvalidFile as InvalidFile
+    from .errors import InvalidType as InvalidType
+    from .errors import MissingExtra as MissingExtra
+    from .errors import MissingFile as MissingFile
+    from .errors import UnghostError as UnghostError
     from .frames import RESOLUTION as RESOLUTION
     from .frames import CubeFrame as CubeFrame
     from .frames import cube_lattices as cube_lattices
@@ -115,6 +126,8 @@ __getattr__, __dir__, __all__ = attach(
             "surroundings_lattice",
             "with_unknown",
         ],
+        ".config": ["check_keys", "from_dict", "nearest", "override", "to_dict"],
+        ".errors": ["InvalidArgument", "InvalidFile", "InvalidType", "MissingExtra", "MissingFile", "UnghostError"],
         ".frames": ["CubeFrame", "RESOLUTION", "cube_lattices", "random_rotations", "unit_lattice"],
         ".interpolate": ["corner_weights", "interpolate_grid", "lower_nodes", "trilinear_corners"],
         ".lattice": ["cell_centers", "cell_pitch", "cells_within", "lattice_axes", "lattice_origin", "look_up_cells"],

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .arrays import to_numpy
+from .errors import InvalidArgument
 
 FloatArray = NDArray[np.float64]
 
@@ -20,12 +21,12 @@ def as_aabb(aabb: ArrayLike | Any, *, caller: str = "as_aabb") -> FloatArray:
     """
     box = np.array(to_numpy(aabb), dtype=np.float64)
     if box.shape != (2, 3):
-        raise ValueError(f"{caller}: aabb must have shape (2, 3), got {box.shape}")
+        raise InvalidArgument(f"{caller}: aabb must have shape (2, 3), got {box.shape}")
     if not np.isfinite(box).all():
-        raise ValueError(f"{caller}: aabb must be finite, got {box.tolist()}")
+        raise InvalidArgument(f"{caller}: aabb must be finite, got {box.tolist()}")
     if not (box[0] < box[1]).all():
         axis = "xyz"[int(np.argmax(box[0] >= box[1]))]
-        raise ValueError(f"{caller}: aabb must have min < max on every axis, {axis} fails in {box.tolist()}")
+        raise InvalidArgument(f"{caller}: aabb must have min < max on every axis, {axis} fails in {box.tolist()}")
     return box
 
 

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from .errors import InvalidType
+
 Array = Any  # a numpy array or a torch tensor; the docstring of each function says which
 
 
@@ -39,7 +41,7 @@ def upcast(density: Any) -> Any:
         TypeError: a tensor of integers or booleans.
     """
     if not density.is_floating_point():
-        raise TypeError(f"upcast: density must be a floating-point tensor, got {density.dtype}")
+        raise InvalidType(f"upcast: density must be a floating-point tensor, got {density.dtype}")
     return density.float() if str(density.dtype) in _HALF else density
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .arrays import is_tensor, to_numpy
+from .errors import InvalidArgument
 
 FloatArray = NDArray[np.float64]
 
@@ -82,20 +83,20 @@ class Cameras:
         """Validate and broadcast: ``(N, 3|4, 4)`` poses, ``(4,)`` or ``(N, 4)`` intrinsics, ``(6,)`` or ``(N, 6)``."""
         poses = np.asarray(to_numpy(camera_to_world), dtype=np.float64)
         if poses.ndim != 3 or poses.shape[1] not in (3, 4) or poses.shape[2] != 4:
-            raise ValueError(f"Cameras: camera_to_world must have shape (N, 3, 4) or (N, 4, 4), got {poses.shape}")
+            raise InvalidArgument(f"Cameras: camera_to_world must have shape (N, 3, 4) or (N, 4, 4), got {poses.shape}")
         if not np.isfinite(poses).all():
-            raise ValueError("Cameras: camera_to_world must be finite")
+            raise InvalidArgument("Cameras: camera_to_world must be finite")
         rotation = poses[:, :3, :3]
         if not np.allclose(rotation @ rotation.swapaxes(1, 2), np.eye(3), atol=1e-3):
-            raise ValueError(
+            raise InvalidArgument(
                 "Cameras: camera_to_world must hold rotations (orthonormal to 1e-3); undo any scaling first"
             )
         count = len(poses)
         lens = np.broadcast_to(np.asarray(to_numpy(intrinsics), dtype=np.float64), (count, 4))
         if not (np.isfinite(lens).all() and (lens[:, :2] > 0).all()):
-            raise ValueError("Cameras: intrinsics fx, fy, cx, cy must be finite with fx, fy > 0")
+            raise InvalidArgument("Cameras: intrinsics fx, fy, cx, cy must be finite with fx, fy > 0")
         if width < 1 or height < 1:
-            raise ValueError(f"Cameras: width and height must be >= 1, got {width} x {height}")
+            raise InvalidArgument(f"Cameras: width and height must be >= 1, got {width} x {height}")
         bend = np.zeros(6) if distortion is None else np.asarray(to_numpy(distortion), dtype=np.float64)
         return cls(poses[:, :3].copy(), lens.copy(), int(width), int(height), np.broadcast_to(bend, (count, 6)).copy())
 

@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .arrays import Array, namespace
+from .errors import InvalidArgument
 from .frames import RESOLUTION, cube_lattices
 from .occupancy import EMPTY, OCCUPIED
 from .shards.storage import MAX_VIEW_COUNT, SURROUNDINGS_EDGE, SURROUNDINGS_RESOLUTION
@@ -50,7 +51,7 @@ def check_channels(names: Sequence[str], *, caller: str) -> tuple[str, ...]:
     """
     given = tuple(names)
     if not given or given[0] != SIGNED_OPACITY or not set(given) <= set(CHANNEL_NAMES) or len(set(given)) < len(given):
-        raise ValueError(
+        raise InvalidArgument(
             f"{caller}: channels must start with {SIGNED_OPACITY!r} and be among {CHANNEL_NAMES}, each once, "
             f"got {given}"
         )

@@ -9,6 +9,8 @@ import typing
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeVar
 
+from .errors import InvalidArgument, InvalidType
+
 Config = TypeVar("Config")
 
 
@@ -39,14 +41,16 @@ def check_keys(given: Iterable[str], known: Iterable[str], *, caller: str, what:
         ValueError: a name is unknown; the message suggests the nearest known one and lists all.
 
     Example:
-        >>> check_keys(["step"], ["seed", "steps"], caller="Run")
+        >>> check_keys(["step"], ["seed", "steps"], caller="Run")  # doctest: +IGNORE_EXCEPTION_DETAIL
         Traceback (most recent call last):
-        ValueError: Run: unknown keys ['step'] (did you mean steps?); known: seed, steps
+        InvalidArgument: Run: unknown keys ['step'] (did you mean steps?); known: seed, steps
     """
     choices = list(known)
     unknown = sorted({str(name) for name in given} - set(choices))
     if unknown:
-        raise ValueError(f"{caller}: unknown {what} {unknown}{nearest(unknown, choices)}; known: {', '.join(choices)}")
+        raise InvalidArgument(
+            f"{caller}: unknown {what} {unknown}{nearest(unknown, choices)}; known: {', '.join(choices)}"
+        )
 
 
 def to_dict(config: Any) -> dict[str, Any]:
@@ -99,13 +103,13 @@ def from_dict(
         ...     widths: tuple[int, ...] = (8, 16)
         >>> from_dict(Run, {"widths": [4]})
         Run(steps=10, widths=(4,))
-        >>> from_dict(Run, {"steps": "many"})
+        >>> from_dict(Run, {"steps": "many"})  # doctest: +IGNORE_EXCEPTION_DETAIL
         Traceback (most recent call last):
-        ValueError: Run: steps must be int, got 'many'
+        InvalidArgument: Run: steps must be int, got 'many'
     """
     name = cls.__name__ if caller is None else caller
     if not isinstance(values, Mapping):
-        raise ValueError(f"{name}: must be a table of keys and values, got {values!r:.80}")
+        raise InvalidArgument(f"{name}: must be a table of keys and values, got {values!r:.80}")
     fields = {item.name: item for item in dataclasses.fields(cls)}  # type: ignore[arg-type]
     check_keys(values, fields, caller=name, what=what)
     absent = [
@@ -114,7 +118,7 @@ def from_dict(
         if item.default is item.default_factory is dataclasses.MISSING and key not in values
     ]
     if absent:
-        raise ValueError(f"{name}: {what} {absent} are missing")
+        raise InvalidArgument(f"{name}: {what} {absent} are missing")
     hints = typing.get_type_hints(cls)
     made: dict[str, Any] = {}
     for key, value in values.items():
@@ -123,7 +127,7 @@ def from_dict(
             continue
         made[key] = _converted(value, hints[key])
         if made[key] is _MISFIT:
-            raise ValueError(f"{name}: {key} must be {_in_words(hints[key])}, got {value!r:.80}")
+            raise InvalidArgument(f"{name}: {key} must be {_in_words(hints[key])}, got {value!r:.80}")
     return cls(**made)
 
 
@@ -173,12 +177,12 @@ def override(config: Config, changes: Mapping[str, Any], *, caller: str, what: s
         ...     steps: int = 10
         >>> override(Run(), {"steps": 3}, caller="train")
         Run(steps=3)
-        >>> override(Run(), {"step": 3}, caller="train")
+        >>> override(Run(), {"step": 3}, caller="train")  # doctest: +IGNORE_EXCEPTION_DETAIL
         Traceback (most recent call last):
-        TypeError: train: unknown settings ['step'] (did you mean steps?); known: steps
+        InvalidType: train: unknown settings ['step'] (did you mean steps?); known: steps
     """
     try:
         check_keys(changes, [item.name for item in dataclasses.fields(config)], caller=caller, what=what)  # type: ignore[arg-type]
     except ValueError as error:
-        raise TypeError(str(error)) from None
+        raise InvalidType(str(error)) from None
     return dataclasses.replace(config, **changes)  # type: ignore[type-var]

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .aabb import scene_extent
+from .errors import InvalidArgument
 
 FloatArray = NDArray[np.float64]
 
@@ -24,7 +25,7 @@ RESOLUTION = 32
 def unit_lattice(resolution: int = RESOLUTION) -> FloatArray:
     """Voxel centres of the cube [-1/2, 1/2]^3, ``(R, R, R, 3)``, unitless."""
     if resolution < 1:
-        raise ValueError(f"unit_lattice: resolution must be >= 1, got {resolution}")
+        raise InvalidArgument(f"unit_lattice: resolution must be >= 1, got {resolution}")
     axis = (np.arange(resolution) + 0.5) / resolution - 0.5
     return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
 
@@ -49,9 +50,9 @@ def cube_lattices(
     centers = np.asarray(centers, dtype=np.float64)
     edges = np.asarray(edge_lengths, dtype=np.float64)
     if centers.ndim != 2 or centers.shape[1] != 3:
-        raise ValueError(f"cube_lattices: centers must have shape (N, 3), got {centers.shape}")
+        raise InvalidArgument(f"cube_lattices: centers must have shape (N, 3), got {centers.shape}")
     if edges.shape != centers.shape[:1]:
-        raise ValueError(f"cube_lattices: edge_lengths must have shape ({len(centers)},), got {edges.shape}")
+        raise InvalidArgument(f"cube_lattices: edge_lengths must have shape ({len(centers)},), got {edges.shape}")
     local = unit_lattice(resolution)[None] * edges[:, None, None, None, None]
     if rotations is not None:
         local = np.einsum("nab,nijkb->nijka", np.asarray(rotations, dtype=np.float64), local)
@@ -88,11 +89,11 @@ class CubeFrame:
         object.__setattr__(self, "center", np.asarray(self.center, dtype=np.float64))
         object.__setattr__(self, "rotation", np.asarray(self.rotation, dtype=np.float64))
         if self.center.shape != (3,):
-            raise ValueError(f"CubeFrame: center must have shape (3,), got {self.center.shape}")
+            raise InvalidArgument(f"CubeFrame: center must have shape (3,), got {self.center.shape}")
         if not (np.isfinite(self.edge_length) and self.edge_length > 0):
-            raise ValueError(f"CubeFrame: edge_length must be finite and > 0, got {self.edge_length}")
+            raise InvalidArgument(f"CubeFrame: edge_length must be finite and > 0, got {self.edge_length}")
         if self.rotation.shape != (3, 3) or not np.allclose(self.rotation @ self.rotation.T, np.eye(3), atol=1e-6):
-            raise ValueError("CubeFrame: rotation must be an orthonormal (3, 3) matrix")
+            raise InvalidArgument("CubeFrame: rotation must be an orthonormal (3, 3) matrix")
 
     def lattice(self, resolution: int = RESOLUTION) -> FloatArray:
         """World positions of the voxel centres, ``(R, R, R, 3)``."""

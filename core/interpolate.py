@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from .arrays import Array, is_tensor, namespace
+from .errors import InvalidArgument, InvalidType
 
 
 def lower_nodes(columns: Sequence[Array], shape: Sequence[int]) -> tuple[list[Array], list[Array]]:
@@ -132,14 +133,14 @@ def interpolate_grid(values: Array, coordinates: Array, *, dtype: Any = None) ->
         array([1., 4.])
     """
     if is_tensor(values) != is_tensor(coordinates):
-        raise TypeError("interpolate_grid: values and coordinates must both be numpy arrays or both be tensors")
+        raise InvalidType("interpolate_grid: values and coordinates must both be numpy arrays or both be tensors")
     shape = tuple(values.shape[:3])
     if values.ndim not in (3, 4) or 0 in shape:
-        raise ValueError(
+        raise InvalidArgument(
             f"interpolate_grid: values must have shape (X, Y, Z) or (X, Y, Z, C), got {tuple(values.shape)}"
         )
     if coordinates.ndim < 1 or coordinates.shape[-1] != 3:
-        raise ValueError(f"interpolate_grid: coordinates must have shape (..., 3), got {tuple(coordinates.shape)}")
+        raise InvalidArgument(f"interpolate_grid: coordinates must have shape (..., 3), got {tuple(coordinates.shape)}")
     module = namespace(values)
     within = [module.clip(column, 0, length - 1) for column, length in zip(_columns(coordinates), shape)]
     base, offsets, shares = _flat_corners(within, shape)

@@ -18,6 +18,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .errors import InvalidArgument, InvalidFile, MissingFile
+
 PARTIAL = ".partial"
 
 
@@ -106,17 +108,17 @@ def read_json(path: str | Path, *, caller: str) -> Any:
         ValueError: the file is not JSON.
 
     Example:
-        >>> read_json("absent.json", caller="example")
+        >>> read_json("absent.json", caller="example")  # doctest: +IGNORE_EXCEPTION_DETAIL
         Traceback (most recent call last):
-        FileNotFoundError: example: no file absent.json
+        MissingFile: example: no file absent.json
     """
     source = Path(path)
     try:
         return json.loads(source.read_text(encoding="utf-8"))
     except (FileNotFoundError, NotADirectoryError):
-        raise FileNotFoundError(f"{caller}: no file {source}") from None
+        raise MissingFile(f"{caller}: no file {source}") from None
     except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ValueError(f"{caller}: {source} is not JSON ({error})") from None
+        raise InvalidFile(f"{caller}: {source} is not JSON ({error})") from None
 
 
 def write_npz(path: str | Path, *, parents: bool = True, **arrays: ArrayLike) -> None:
@@ -153,7 +155,9 @@ def new_folder(path: str | Path, *, unique: bool = True) -> Iterator[Path]:
     """
     target = Path(path)
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        raise ValueError(f"new_folder: {target} is there already and not empty: choose another folder, or remove it")
+        raise InvalidArgument(
+            f"new_folder: {target} is there already and not empty: choose another folder, or remove it"
+        )
     target.parent.mkdir(parents=True, exist_ok=True)
     if unique:
         partial = Path(tempfile.mkdtemp(prefix=f"{target.name}.", suffix=PARTIAL, dir=target.parent))

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .aabb import as_aabb
+from .errors import InvalidArgument
 
 
 def cell_centers(aabb: ArrayLike, shape: tuple[int, int, int]) -> NDArray[np.float32]:
@@ -26,7 +27,9 @@ def cell_pitch(aabb: ArrayLike, shape: tuple[int, ...], *, caller: str = "cell_p
     box = as_aabb(aabb, caller=caller)
     sides = (box[1] - box[0]) / np.array(shape, dtype=float)
     if sides.max() > 1.01 * sides.min():
-        raise ValueError(f"{caller}: aabb and grid must make cubic cells (to 1 %), got sides {sides.round(6).tolist()}")
+        raise InvalidArgument(
+            f"{caller}: aabb and grid must make cubic cells (to 1 %), got sides {sides.round(6).tolist()}"
+        )
     return float(sides.mean())
 
 

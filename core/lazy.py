@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from typing import Any
 
+from .errors import MissingExtra
+
 
 def attach(
     package: str, homes: Mapping[str, Sequence[str]], *, extras: Mapping[str, str] | None = None
@@ -42,7 +44,7 @@ def attach(
             if home not in (extras or {}) or missing in ("", "unghost"):
                 raise
             needed = f"pip install unghost[{(extras or {})[home]}]"
-            raise ImportError(f"{package}.{name} needs {missing}: {needed}", name=error.name) from error
+            raise MissingExtra(f"{package}.{name} needs {missing}: {needed}", name=error.name) from error
         setattr(sys.modules[package], name, value)
         return value
 

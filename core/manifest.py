@@ -10,6 +10,7 @@ from typing import Any, Protocol
 
 from .channels import check_channels
 from .config import from_dict, to_dict
+from .errors import InvalidArgument, InvalidFile
 from .frames import RESOLUTION
 from .schedule import TIMESTEPS
 
@@ -50,9 +51,11 @@ class Manifest:
     def __post_init__(self) -> None:
         object.__setattr__(self, "channels", check_channels(self.channels, caller="Manifest"))
         if not 0 <= self.default_timestep < TIMESTEPS:
-            raise ValueError(f"Manifest: default_timestep must lie in [0, {TIMESTEPS}), got {self.default_timestep}")
+            raise InvalidArgument(
+                f"Manifest: default_timestep must lie in [0, {TIMESTEPS}), got {self.default_timestep}"
+            )
         if not (math.isfinite(self.removal_threshold) and -1.0 <= self.removal_threshold <= 1.0):
-            raise ValueError(f"Manifest: removal_threshold must lie in [-1, 1], got {self.removal_threshold}")
+            raise InvalidArgument(f"Manifest: removal_threshold must lie in [-1, 1], got {self.removal_threshold}")
 
     def to_json(self) -> str:
         """One JSON object, keys sorted."""
@@ -65,12 +68,12 @@ class Manifest:
         try:
             body = json.loads(text)
         except json.JSONDecodeError as error:
-            raise ValueError(f"{origin}: the unghost manifest is not JSON ({error})") from None
+            raise InvalidFile(f"{origin}: the unghost manifest is not JSON ({error})") from None
         if not isinstance(body, dict) or body.pop("format", None) != FORMAT:
-            raise ValueError(f"{origin}: not an unghost denoiser (format must be {FORMAT!r})")
+            raise InvalidFile(f"{origin}: not an unghost denoiser (format must be {FORMAT!r})")
         version = body.pop("format_version", None)
         if version != FORMAT_VERSION:
-            raise ValueError(f"{origin}: manifest version {version!r}, this release reads {FORMAT_VERSION}")
+            raise InvalidFile(f"{origin}: manifest version {version!r}, this release reads {FORMAT_VERSION}")
         return from_dict(cls, body, caller=origin, what="manifest keys")
 
 

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Literal
 
+from .errors import InvalidArgument
+
 Better = Literal["higher", "lower", "none"]
 
 
@@ -202,7 +204,7 @@ def get_metric(key: str) -> Metric:
         ('PSNR, dB', 'higher', 2)
     """
     if key not in METRICS:
-        raise ValueError(f"get_metric: key must be one of {', '.join(METRICS)}, got {key!r}")
+        raise InvalidArgument(f"get_metric: key must be one of {', '.join(METRICS)}, got {key!r}")
     return METRICS[key]
 
 

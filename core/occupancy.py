@@ -17,6 +17,7 @@ from typing import Any, Literal
 import numpy as np
 
 from .arrays import Array, namespace, to_numpy
+from .errors import InvalidArgument, InvalidType
 
 EMPTY = -1.0
 OCCUPIED = 1.0
@@ -70,10 +71,12 @@ class OccupancyRule:
 
     def __post_init__(self) -> None:
         if self.kind not in ("opacity", "density"):
-            raise ValueError(f"OccupancyRule: kind must be 'opacity' or 'density', got {self.kind!r}")
+            raise InvalidArgument(f"OccupancyRule: kind must be 'opacity' or 'density', got {self.kind!r}")
         upper = 1.0 if self.kind == "opacity" else math.inf
         if not 0.0 < self.threshold < upper:
-            raise ValueError(f"OccupancyRule: threshold must lie in (0, {upper}) for {self.kind}, got {self.threshold}")
+            raise InvalidArgument(
+                f"OccupancyRule: threshold must lie in (0, {upper}) for {self.kind}, got {self.threshold}"
+            )
 
     @classmethod
     def paper(cls) -> OccupancyRule:
@@ -125,7 +128,7 @@ def check_density(density: Array, positions: Array, *, caller: str) -> None:
     found = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
     where = int(np.argmin(good))
     place = np.round(to_numpy(positions).reshape(-1, 3)[where].astype(float), 6).tolist()
-    raise ValueError(
+    raise InvalidArgument(
         f"{caller}: densities must be finite and >= 0, got {found} of {values.size}; first {values[where]} at {place}"
     )
 
@@ -144,11 +147,11 @@ def check_density_shape(density: Any, positions: Array, *, caller: str) -> Array
     lead = tuple(positions.shape[:-1])
     shape = tuple(getattr(density, "shape", ()))
     if not hasattr(density, "shape"):
-        raise TypeError(f"{caller}: density_fn must return an array or tensor, got {type(density).__name__}")
+        raise InvalidType(f"{caller}: density_fn must return an array or tensor, got {type(density).__name__}")
     if shape == (*lead, 1):
         return density[..., 0]
     if shape == lead:
         return density
-    raise ValueError(
+    raise InvalidArgument(
         f"{caller}: density_fn must return shape {(*lead, 1)} or {lead} for positions {(*lead, 3)}, got {shape}"
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from .arrays import Array
+from .errors import InvalidArgument
 
 
 def distortion(weights: Array, edges: Array) -> Array:
@@ -23,7 +24,7 @@ def distortion(weights: Array, edges: Array) -> Array:
     """
     wanted = (*weights.shape[:-1], weights.shape[-1] + 1)
     if tuple(edges.shape) != wanted:
-        raise ValueError(f"distortion: edges must have shape {wanted}, got {tuple(edges.shape)}")
+        raise InvalidArgument(f"distortion: edges must have shape {wanted}, got {tuple(edges.shape)}")
     width = edges[..., 1:] - edges[..., :-1]
     middle = edges[..., :-1] + width / 2
     before = weights.cumsum(-1) - weights

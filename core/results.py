@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from .errors import InvalidArgument
 from .io import write_json
 
 REPORTED_PACKAGES = ("numpy", "onnxruntime", "torch", "scipy", "scikit-image", "open3d-cpu", "trimesh")
@@ -60,7 +61,7 @@ def build_results(
     """Assemble the results object; every row must have a ``method``."""
     for row in rows:
         if "method" not in row:
-            raise ValueError(f"build_results: every row needs a 'method', got keys {sorted(row)}")
+            raise InvalidArgument(f"build_results: every row needs a 'method', got keys {sorted(row)}")
     if command is None:
         command = " ".join(["python", Path(sys.argv[0]).name, *sys.argv[1:]])
     return {

@@ -11,6 +11,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .errors import InvalidArgument, InvalidType
+
 TIMESTEPS = 1000
 BETA_START, BETA_END = 0.0015, 0.05  # linear, as in the published configuration
 
@@ -46,7 +48,7 @@ def strided_timesteps(count: int) -> NDArray[np.int64]:
         ValueError: ``count`` outside [1, 1000].
     """
     if not 1 <= count <= TIMESTEPS:
-        raise ValueError(f"strided_timesteps: count must lie in [1, {TIMESTEPS}], got {count}")
+        raise InvalidArgument(f"strided_timesteps: count must lie in [1, {TIMESTEPS}], got {count}")
     steps: NDArray[np.int64] = np.rint(np.linspace(TIMESTEPS - 1, 0, count)).astype(np.int64)
     return steps
 
@@ -55,7 +57,9 @@ def timestep_from_severity(severity: ArrayLike) -> NDArray[np.int64]:
     """Severity in [0, 1] to a timestep in [0, 999], rounded to the nearest."""
     value = np.asarray(severity, dtype=np.float64)
     if not ((value >= 0) & (value <= 1)).all():
-        raise ValueError(f"timestep_from_severity: severity must lie in [0, 1], got {value.min()} .. {value.max()}")
+        raise InvalidArgument(
+            f"timestep_from_severity: severity must lie in [0, 1], got {value.min()} .. {value.max()}"
+        )
     steps: NDArray[np.int64] = np.rint(value * (TIMESTEPS - 1)).astype(np.int64)
     return steps
 
@@ -64,7 +68,7 @@ def check_timestep(timestep: ArrayLike, *, caller: str) -> NDArray[np.int64]:
     """Integer timesteps in [0, 1000), any shape, as int64."""
     value = np.asarray(timestep)
     if value.dtype.kind not in "iu":
-        raise TypeError(f"{caller}: timestep must be an integer, got dtype {value.dtype}")
+        raise InvalidType(f"{caller}: timestep must be an integer, got dtype {value.dtype}")
     if value.size and (value.min() < 0 or value.max() >= TIMESTEPS):
-        raise ValueError(f"{caller}: timestep must lie in [0, {TIMESTEPS}), got {value.min()} .. {value.max()}")
+        raise InvalidArgument(f"{caller}: timestep must lie in [0, {TIMESTEPS}), got {value.min()} .. {value.max()}")
     return value.astype(np.int64)

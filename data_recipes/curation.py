@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from ..core.errors import InvalidArgument
 from ..core.shards.storage import read_shard, write_shard
 from .engines import WorkerDied, open_engine, spans
 from .folder_lock import locked
@@ -46,7 +47,7 @@ class _Plan:
             if there.get(key) != value
         ]
         if differing:
-            raise ValueError(
+            raise InvalidArgument(
                 f"curate: {self.folder} holds another curation ({'; '.join(differing)}): "
                 "choose another out folder or remove it"
             )
@@ -183,9 +184,9 @@ def _check_numbers(**numbers: tuple[int, int]) -> None:
     """Each is a value and the least it may be; ``count`` has a most as well."""
     for name, (value, least) in numbers.items():
         if value < least:
-            raise ValueError(f"curate: {name} must be >= {least}, got {value}")
+            raise InvalidArgument(f"curate: {name} must be >= {least}, got {value}")
     if numbers["count"][0] > MAX_COUNT:
-        raise ValueError(f"curate: count must be <= {MAX_COUNT}, got {numbers['count'][0]}")
+        raise InvalidArgument(f"curate: count must be <= {MAX_COUNT}, got {numbers['count'][0]}")
 
 
 def _write(

@@ -20,13 +20,15 @@ from multiprocessing import connection
 from types import TracebackType
 from typing import Any, Protocol, TypeVar
 
+from ..core.errors import InvalidArgument, MissingExtra, UnghostError
+
 Result = TypeVar("Result")
 Task = tuple[Any, ...]
 
 MAX_DEATHS = 3  # of workers over one and the same call
 
 
-class WorkerDied(ChildProcessError):
+class WorkerDied(UnghostError, ChildProcessError):
     """A worker died whenever it made a certain call; the message names it."""
 
 
@@ -161,7 +163,7 @@ class RayEngine:
         try:
             import ray
         except ImportError as error:
-            raise ImportError("engines: the engine ray needs Ray: pip install unghost[scale]") from error
+            raise MissingExtra("engines: the engine ray needs Ray: pip install unghost[scale]") from error
         if not ray.is_initialized():
             try:
                 ray.init(address="auto", log_to_driver=False, logging_level="error")
@@ -212,7 +214,7 @@ ENGINES: dict[str, Callable[[int], Engine]] = {"local": LocalEngine, "ray": RayE
 
 def _check_workers(workers: int) -> None:
     if workers < 1:
-        raise ValueError(f"engines: workers must be >= 1, got {workers}")
+        raise InvalidArgument(f"engines: workers must be >= 1, got {workers}")
 
 
 def open_engine(name: str, workers: int) -> Engine:
@@ -227,7 +229,7 @@ def open_engine(name: str, workers: int) -> Engine:
         ImportError: on entering ``"ray"`` without Ray.
     """
     if name not in ENGINES:
-        raise ValueError(f"open_engine: engine must be one of {', '.join(ENGINES)}, got {name!r}")
+        raise InvalidArgument(f"open_engine: engine must be one of {', '.join(ENGINES)}, got {name!r}")
     return ENGINES[name](workers)
 
 

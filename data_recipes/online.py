@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.errors import InvalidArgument
 from ..core.shards.packing import dequantize_signed, unpack_labels
 from .engines import LocalEngine, spans
 from .pairs import Chunk, checked_root, close_meshes, make_chunk
@@ -77,7 +78,7 @@ class OnlinePairs:
     def __init__(self, recipe: Recipe, *, seed: int, workers: int = 1, mesh_root: str | Path | None = None) -> None:
         for name, value, least in (("seed", seed, 0), ("workers", workers, 1)):
             if value < least:
-                raise ValueError(f"OnlinePairs: {name} must be >= {least}, got {value}")
+                raise InvalidArgument(f"OnlinePairs: {name} must be >= {least}, got {value}")
         self.recipe, self.seed, self.workers = recipe, seed, workers
         self._root = checked_root(recipe, mesh_root)
         if self._root is not None:
@@ -108,7 +109,7 @@ class OnlinePairs:
         """
         _check(first_step, batch_size)
         if ahead < 1:
-            raise ValueError(f"OnlinePairs.stream: ahead must be >= 1, got {ahead}")
+            raise InvalidArgument(f"OnlinePairs.stream: ahead must be >= 1, got {ahead}")
         return self._stream(first_step * batch_size, batch_size, ahead)
 
     def _stream(self, first: int, batch_size: int, ahead: int) -> Generator[PairBatch, None, None]:
@@ -127,4 +128,4 @@ class OnlinePairs:
 
 def _check(step: int, batch_size: int) -> None:
     if step < 0 or batch_size < 1:
-        raise ValueError(f"OnlinePairs: step must be >= 0 and batch_size >= 1, got {step} and {batch_size}")
+        raise InvalidArgument(f"OnlinePairs: step must be >= 0 and batch_size >= 1, got {step} and {batch_size}")

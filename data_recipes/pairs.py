@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.errors import InvalidArgument, UnghostError
 from ..core.frames import CubeFrame
 from ..core.occupancy import FREE_LABEL, IGNORE_LABEL, SURFACE_LABEL, signed_from_occupancy
 from ..core.shards.packing import pack_frame, pack_labels, quantize_signed
@@ -26,7 +27,7 @@ Arrays = dict[str, NDArray[Any]]
 Notes = dict[int, dict[str, Any]]  # about meshes, by their row in the manifest
 
 
-class SampleError(ValueError):
+class SampleError(UnghostError, ValueError):
     """A sample could not be made; the message names it and says why."""
 
 
@@ -148,7 +149,9 @@ def checked_root(recipe: Recipe, mesh_root: str | Path | None) -> str | None:
     if recipe.source != "meshes":
         return None
     if mesh_root is None:
-        raise ValueError(f"curate: recipe {recipe.name!r} reads meshes: mesh_root must name their folder, got None")
+        raise InvalidArgument(
+            f"curate: recipe {recipe.name!r} reads meshes: mesh_root must name their folder, got None"
+        )
     return str(mesh_root)
 
 
@@ -172,7 +175,8 @@ def _named(arrays: Arrays, first: int, recipe: Recipe, index: int, seed: int, me
     try:
         return _fill(arrays, first, recipe, [index], seed, mesh_root)
     except Exception as error:
-        raise SampleError(f"curate: sample {index} of seed {seed}: {type(error).__name__}: {error}") from error
+        said = str(error) if isinstance(error, UnghostError) else f"{type(error).__name__}: {error}"
+        raise SampleError(f"curate: sample {index} of seed {seed}: {said}") from error
 
 
 def make_chunk(recipe: Recipe, seed: int, mesh_root: str | None, start: int, stop: int) -> Chunk:

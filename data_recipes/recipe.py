@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.config import check_keys, from_dict, nearest, to_dict
+from ..core.errors import InvalidArgument, InvalidFile, MissingFile
 from .solids.primitives import FAMILIES
 
 if sys.version_info >= (3, 11):
@@ -104,29 +105,31 @@ class Recipe:
             least = 0.0 if name == "severity" else 1e-9
             if not (math.isfinite(high) and least <= low <= high):
                 rule = "0 <= low <= high" if name == "severity" else "0 < low <= high"
-                raise ValueError(f"Recipe: {name} must be (low, high) with {rule}, got {(low, high)}")
+                raise InvalidArgument(f"Recipe: {name} must be (low, high) with {rule}, got {(low, high)}")
         for name, ceiling in (("edge_fraction", 1.0), ("severity", 1.0)):
             if self._pair(name)[1] > ceiling:
-                raise ValueError(f"Recipe: {name} must not exceed {ceiling}, got {self._pair(name)}")
+                raise InvalidArgument(f"Recipe: {name} must not exceed {ceiling}, got {self._pair(name)}")
         for field in fields(self):
             value = getattr(self, field.name)
             if field.name.endswith("_share") and not 0.0 <= value <= 1.0:
-                raise ValueError(f"Recipe: {field.name} must lie in [0, 1], got {value}")
+                raise InvalidArgument(f"Recipe: {field.name} must lie in [0, 1], got {value}")
         if self.on_share + self.near_share > 1.0 + 1e-9:
-            raise ValueError(f"Recipe: on_share + near_share must be <= 1, got {self.on_share} + {self.near_share}")
+            raise InvalidArgument(
+                f"Recipe: on_share + near_share must be <= 1, got {self.on_share} + {self.near_share}"
+            )
         for name, least in (("max_dilation", 0), ("soft_dilation", 0), ("cubes_per_mesh", 1), ("parts", 1)):
             value = getattr(self, name)
             for number in value if isinstance(value, tuple) else (value,):
                 if not isinstance(number, int) or isinstance(number, bool) or number < least:
-                    raise ValueError(f"Recipe: {name} must be whole and >= {least}, got {value!r}")
+                    raise InvalidArgument(f"Recipe: {name} must be whole and >= {least}, got {value!r}")
         if not self.severity_exponent > 0 or not 0 <= self.center_jitter <= 0.5:
-            raise ValueError(
+            raise InvalidArgument(
                 "Recipe: severity_exponent must be > 0 and center_jitter in [0, 0.5], "
                 f"got {self.severity_exponent} and {self.center_jitter}"
             )
 
         if not (self.remesh_edge == 0 or (self.repair and 0.001 <= self.remesh_edge <= 0.5)):
-            raise ValueError(
+            raise InvalidArgument(
                 "Recipe: remesh_edge must be 0, or in [0.001, 0.5] where repair is true, "
                 f"got {self.remesh_edge} with repair = {str(self.repair).lower()}"
             )
@@ -135,14 +138,14 @@ class Recipe:
         value = getattr(self, name)
         numbers = isinstance(value, tuple) and all(isinstance(v, (int, float)) for v in value)
         if not numbers or len(value) != 2:
-            raise ValueError(f"Recipe: {name} must be two numbers (low, high), got {value!r}")
+            raise InvalidArgument(f"Recipe: {name} must be two numbers (low, high), got {value!r}")
         return value[0], value[1]
 
     def _check_choices(self) -> None:
         if self.source not in SOURCES:
-            raise ValueError(f"Recipe: source must be one of {', '.join(SOURCES)}, got {self.source!r}")
+            raise InvalidArgument(f"Recipe: source must be one of {', '.join(SOURCES)}, got {self.source!r}")
         if self.split not in SPLITS:
-            raise ValueError(f"Recipe: split must be one of {', '.join(SPLITS)}, got {self.split!r}")
+            raise InvalidArgument(f"Recipe: split must be one of {', '.join(SPLITS)}, got {self.split!r}")
         check_keys(self.families, FAMILIES, caller="Recipe", what="families")
 
     def to_dict(self) -> dict[str, Any]:
@@ -191,11 +194,11 @@ def load_recipe(path_or_name: str | Path) -> Recipe:
     if not path.is_file():
         names = builtin_recipes()
         hint = nearest([str(path_or_name)], names)
-        raise FileNotFoundError(
+        raise MissingFile(
             f"load_recipe: {path_or_name} is neither a file nor a built-in recipe{hint} ({', '.join(names)})"
         )
     try:
         values = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"load_recipe: {path} is not TOML ({error})") from None
+        raise InvalidFile(f"load_recipe: {path} is not TOML ({error})") from None
     return recipe_from_mapping(values)

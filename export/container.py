@@ -13,6 +13,7 @@ import dataclasses
 import hashlib
 from pathlib import Path
 
+from ..core.errors import InvalidArgument, InvalidFile
 from ..core.io import write_bytes
 from ..core.manifest import METADATA_KEY, Manifest
 
@@ -67,28 +68,28 @@ def unseal(data: bytes, *, origin: str) -> Manifest:
     marker = KEY_TAG + _varint(len(METADATA_KEY)) + METADATA_KEY.encode() + VALUE_TAG
     at = data.rfind(marker)
     if at < 0:
-        raise ValueError(
+        raise InvalidFile(
             f"{origin}: no {METADATA_KEY!r} entry: not an unghost ONNX model, or truncated ({len(data)} bytes)"
         )
     try:
         length, start = _read_varint(data, at + len(marker))
     except IndexError:
-        raise ValueError(f"{origin}: truncated inside its manifest ({len(data)} bytes)") from None
+        raise InvalidFile(f"{origin}: truncated inside its manifest ({len(data)} bytes)") from None
     if start + length != len(data):
         what = "truncated inside its manifest" if start + length > len(data) else "bytes follow its manifest"
-        raise ValueError(f"{origin}: {what} ({len(data)} bytes, {start + length} expected)")
+        raise InvalidFile(f"{origin}: {what} ({len(data)} bytes, {start + length} expected)")
     try:
         text = data[start:].decode("utf-8")
     except UnicodeDecodeError as error:
-        raise ValueError(f"{origin}: its manifest is not UTF-8 ({error})") from None
+        raise InvalidFile(f"{origin}: its manifest is not UTF-8 ({error})") from None
     manifest = Manifest.from_json(text, origin=origin)
     body = data[: manifest.body_bytes]
     if data[len(body) : start] != _entry_head(length):
-        raise ValueError(
+        raise InvalidFile(
             f"{origin}: its body has {start - len(_entry_head(length))} bytes, its manifest says {manifest.body_bytes}"
         )
     if hashlib.sha256(body).hexdigest() != manifest.body_sha256:
-        raise ValueError(f"{origin}: the body does not match the SHA-256 in its manifest: altered or damaged")
+        raise InvalidFile(f"{origin}: the body does not match the SHA-256 in its manifest: altered or damaged")
     return manifest
 
 
@@ -106,5 +107,5 @@ def precision_of(manifest: Manifest) -> str:
     export = manifest.training.get("export")
     precision = export.get("precision") if isinstance(export, dict) else "fp32"
     if precision not in PRECISIONS:
-        raise ValueError(f"{manifest.name}: precision must be one of {', '.join(PRECISIONS)}, got {precision!r}")
+        raise InvalidArgument(f"{manifest.name}: precision must be one of {', '.join(PRECISIONS)}, got {precision!r}")
     return str(precision)

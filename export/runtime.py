@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.channels import with_unknown
+from ..core.errors import InvalidArgument, InvalidFile, InvalidType
 from ..core.frames import RESOLUTION
 from ..core.manifest import Manifest
 from ..core.schedule import check_timestep
@@ -34,7 +35,7 @@ def read_file(path: str | Path) -> bytes:
     """The bytes of a file; ValueError if there is none."""
     source = Path(path)
     if not source.is_file():
-        raise ValueError(f"{source}: no such file")
+        raise InvalidFile(f"{source}: no such file")
     return source.read_bytes()
 
 
@@ -51,7 +52,7 @@ def choose_providers(asked: Sequence[str] | None, available: Sequence[str]) -> l
     chosen = [name for name in PREFERRED if name in available] if asked is None else list(asked)
     missing = [name for name in chosen if name not in available]
     if missing or not chosen:
-        raise ValueError(f"OnnxDenoiser: providers {missing} are not available, onnxruntime has {list(available)}")
+        raise InvalidArgument(f"OnnxDenoiser: providers {missing} are not available, onnxruntime has {list(available)}")
     return chosen
 
 
@@ -62,24 +63,24 @@ def _open(data: bytes, threads: int | None, providers: Sequence[str] | None, ori
     options = onnxruntime.SessionOptions()
     if threads is not None:
         if threads < 1:
-            raise ValueError(f"OnnxDenoiser: threads must be >= 1 or None, got {threads}")
+            raise InvalidArgument(f"OnnxDenoiser: threads must be >= 1 or None, got {threads}")
         options.intra_op_num_threads = threads
     try:
         return onnxruntime.InferenceSession(data, options, providers=chosen)
     except Exception as error:  # onnxruntime's errors share no public base class
-        raise ValueError(f"{origin}: onnxruntime cannot load it ({error})") from None
+        raise InvalidFile(f"{origin}: onnxruntime cannot load it ({error})") from None
 
 
 def _edge_fractions(edge_fraction: Any, count: int) -> NDArray[np.float32]:
     value = np.asarray(edge_fraction)
     if value.dtype.kind not in "fiu":
-        raise TypeError(f"OnnxDenoiser: edge_fraction must be real, got dtype {value.dtype}")
+        raise InvalidType(f"OnnxDenoiser: edge_fraction must be real, got dtype {value.dtype}")
     if value.shape not in ((), (count,)):
-        raise ValueError(f"OnnxDenoiser: edge_fraction must have shape () or ({count},), got {value.shape}")
+        raise InvalidArgument(f"OnnxDenoiser: edge_fraction must have shape () or ({count},), got {value.shape}")
     edges = np.broadcast_to(value, (count,)).astype(np.float32)
     if not (np.isfinite(edges) & (edges > 0)).all():
         worst = edges[~(np.isfinite(edges) & (edges > 0))][0]
-        raise ValueError(f"OnnxDenoiser: edge_fraction must be finite and > 0 in float32, got {worst}")
+        raise InvalidArgument(f"OnnxDenoiser: edge_fraction must be finite and > 0 in float32, got {worst}")
     return edges
 
 
@@ -139,17 +140,19 @@ class OnnxDenoiser:
         """
         if not isinstance(channels, np.ndarray) or channels.dtype != np.float32:
             found = getattr(channels, "dtype", type(channels).__name__)
-            raise TypeError(f"OnnxDenoiser: channels must be a float32 numpy array, got {found}")
+            raise InvalidType(f"OnnxDenoiser: channels must be a float32 numpy array, got {found}")
         channels = with_unknown(channels, len(self.manifest.channels))
         cube = (len(self.manifest.channels), RESOLUTION, RESOLUTION, RESOLUTION)
         if channels.shape[1:] != cube or channels.ndim != 5:
-            raise ValueError(f"OnnxDenoiser: channels must have shape (N, {str(cube)[1:]}, got {channels.shape}")
+            raise InvalidArgument(f"OnnxDenoiser: channels must have shape (N, {str(cube)[1:]}, got {channels.shape}")
         if not np.isfinite(channels).all():
-            raise ValueError(f"OnnxDenoiser: channels must be finite, got {int((~np.isfinite(channels)).sum())} others")
+            raise InvalidArgument(
+                f"OnnxDenoiser: channels must be finite, got {int((~np.isfinite(channels)).sum())} others"
+            )
         count = len(channels)
         times = check_timestep(timestep, caller="OnnxDenoiser")
         if times.shape not in ((), (count,)):
-            raise ValueError(f"OnnxDenoiser: timestep must have shape () or ({count},), got {times.shape}")
+            raise InvalidArgument(f"OnnxDenoiser: timestep must have shape () or ({count},), got {times.shape}")
         times = np.broadcast_to(times, (count,))
         edges = _edge_fractions(edge_fraction, count)
         x0_pred = np.empty((count, 1, *cube[1:]), np.float32)

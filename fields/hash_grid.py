@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ..core.errors import InvalidArgument
 from ..core.interpolate import corner_weights, lower_nodes
 from .implicit import EncodedField, check_encoded
 from .trilinear import weighted_rows
@@ -55,14 +56,16 @@ class HashConfig:
     def __post_init__(self) -> None:
         check_encoded(self)
         if not 1 <= self.base_resolution <= self.resolution:
-            raise ValueError(
+            raise InvalidArgument(
                 f"HashConfig: base_resolution must lie in [1, resolution = {self.resolution}], "
                 f"got {self.base_resolution}"
             )
         if min(self.levels, self.features) < 1:
-            raise ValueError(f"HashConfig: levels and features must be >= 1, got {self.levels} and {self.features}")
+            raise InvalidArgument(
+                f"HashConfig: levels and features must be >= 1, got {self.levels} and {self.features}"
+            )
         if not 2 <= self.rows <= 2**20 or self.rows & (self.rows - 1):
-            raise ValueError(f"HashConfig: rows must be a power of two in [2, 2^20], got {self.rows}")
+            raise InvalidArgument(f"HashConfig: rows must be a power of two in [2, 2^20], got {self.rows}")
 
     @property
     def resolutions(self) -> tuple[int, ...]:
@@ -129,7 +132,7 @@ def hash_encode(table: Tensor, unit: Tensor, resolutions: tuple[int, ...], rows:
     """
     sizes = [level_rows(resolution, rows) for resolution in resolutions]
     if len(table) != sum(sizes):
-        raise ValueError(f"hash_encode: table must have {sum(sizes)} rows for {resolutions}, got {len(table)}")
+        raise InvalidArgument(f"hash_encode: table must have {sum(sizes)} rows for {resolutions}, got {len(table)}")
     count, levels = len(unit), len(resolutions)
     index = torch.empty(levels, count, 8, dtype=torch.int32, device=unit.device)
     weights = torch.empty(levels, count, 8, dtype=table.dtype, device=unit.device)

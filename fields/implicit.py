@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from ..core.errors import InvalidArgument
 from .radiance import CONTRACTED, Shade, contract
 
 FEATURES = 15  # what the trunk tells the colour head, besides the density
@@ -54,11 +55,11 @@ def check_encoded(config: EncodedConfig) -> None:
     """Raise a ``ValueError`` that names the field which is out of range."""
     name = type(config).__name__
     if config.resolution < 4:
-        raise ValueError(f"{name}: resolution must be >= 4, got {config.resolution}")
+        raise InvalidArgument(f"{name}: resolution must be >= 4, got {config.resolution}")
     if min(config.width, config.hidden) < 1:
-        raise ValueError(f"{name}: width and hidden must be >= 1, got {config.width} and {config.hidden}")
+        raise InvalidArgument(f"{name}: width and hidden must be >= 1, got {config.width} and {config.hidden}")
     if not 0.0 < config.initial_opacity < 1.0:
-        raise ValueError(f"{name}: initial_opacity must lie in (0, 1), got {config.initial_opacity}")
+        raise InvalidArgument(f"{name}: initial_opacity must lie in (0, 1), got {config.initial_opacity}")
 
 
 def network(sizes: list[int], generator: torch.Generator) -> nn.Sequential:

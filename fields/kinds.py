@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ..core.errors import InvalidArgument
 from .frequency_mlp import FrequencyConfig, FrequencyField
 from .hash_grid import HashConfig, HashField
 from .radiance import RadianceConfig, RadianceField, Shade
@@ -90,5 +91,5 @@ def make_field(
         ['RadianceField', 'HashField', 'FrequencyField']
     """
     if kind not in KINDS:
-        raise ValueError(f"make_field: kind must be one of {', '.join(KINDS)}, got {kind!r}")
+        raise InvalidArgument(f"make_field: kind must be one of {', '.join(KINDS)}, got {kind!r}")
     return KINDS[kind](resolution, initial_opacity, contract, seed)

@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ..core.errors import InvalidArgument
 from .trilinear import trilinear
 
 CONTRACTED = 2.0  # half side of the contracted cube
@@ -44,11 +45,11 @@ class RadianceConfig:
 
     def __post_init__(self) -> None:
         if min(self.resolution, self.color_resolution) < 4:
-            raise ValueError(
+            raise InvalidArgument(
                 f"RadianceConfig: resolutions must be >= 4, got {self.resolution}, {self.color_resolution}"
             )
         if not 0.0 < self.initial_opacity < 1.0:
-            raise ValueError(f"RadianceConfig: initial_opacity must lie in (0, 1), got {self.initial_opacity}")
+            raise InvalidArgument(f"RadianceConfig: initial_opacity must lie in (0, 1), got {self.initial_opacity}")
 
 
 def contract(positions: Tensor) -> Tensor:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..core.cameras import Cameras
+from ..core.errors import InvalidArgument
 from ..core.ray_distortion import distortion
 from .kinds import TrainableField
 from .rendering import Rendering, Sampling, render_rays
@@ -73,9 +74,9 @@ def gather_rays(cameras: Cameras, images: NDArray[np.float32]) -> tuple[Tensor, 
     """
     expected = (len(cameras), cameras.height, cameras.width, 3)
     if images.shape != expected:
-        raise ValueError(f"gather_rays: images must have shape {expected}, got {images.shape}")
+        raise InvalidArgument(f"gather_rays: images must have shape {expected}, got {images.shape}")
     if images.dtype.kind != "f":
-        raise ValueError(f"gather_rays: images must be floating point in [0, 1], got dtype {images.dtype}")
+        raise InvalidArgument(f"gather_rays: images must be floating point in [0, 1], got dtype {images.dtype}")
     rays = [cameras.rays(index) for index in range(len(cameras))]
     origins, directions = (np.concatenate([ray[part].reshape(-1, 3) for ray in rays]) for part in (0, 1))
     starts, towards, colors = (
@@ -90,11 +91,11 @@ class _Progress:
 
     def __init__(self, steps: int | None, seconds: float | None) -> None:
         if steps is None and seconds is None:
-            raise ValueError("train_field: give steps or seconds (or both)")
+            raise InvalidArgument("train_field: give steps or seconds (or both)")
         if steps is not None and steps < 1:
-            raise ValueError(f"train_field: steps must be >= 1, got {steps}")
+            raise InvalidArgument(f"train_field: steps must be >= 1, got {steps}")
         if seconds is not None and not seconds > 0:
-            raise ValueError(f"train_field: seconds must be > 0, got {seconds}")
+            raise InvalidArgument(f"train_field: seconds must be > 0, got {seconds}")
         self.steps, self.seconds, self.start = steps, seconds, time.perf_counter()
 
     def __call__(self, step: int) -> float:

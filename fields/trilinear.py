@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..core.errors import InvalidArgument
 from ..core.interpolate import trilinear_corners
 
 
@@ -94,7 +95,7 @@ def trilinear(table: Tensor, coordinates: Tensor, resolution: int) -> Tensor:
         [[3.0]]
     """
     if table.shape[0] != resolution**3:
-        raise ValueError(
+        raise InvalidArgument(
             f"trilinear: table must have {resolution**3} rows for resolution {resolution}, got {len(table)}"
         )
     return weighted_rows(table, *trilinear_corners(coordinates.detach(), (resolution,) * 3))

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ..core.channels import with_unknown
+from ..core.errors import InvalidArgument, InvalidFile, InvalidType, MissingExtra
 from ..core.io import write_bytes
 from ..core.manifest import METADATA_KEY, Manifest
 from ..core.schedule import TIMESTEPS
@@ -32,7 +33,7 @@ def write_tensors(path: str | Path, tensors: Mapping[str, Tensor], metadata: Map
     try:
         from safetensors.torch import save
     except ImportError:
-        raise ImportError("write_tensors: needs safetensors: pip install unghost[torch]") from None
+        raise MissingExtra("write_tensors: needs safetensors: pip install unghost[torch]") from None
     plain = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
     write_bytes(path, _ordered(save(plain, dict(metadata))), fsync=True)
 
@@ -46,16 +47,16 @@ def read_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     try:
         from safetensors import SafetensorError, safe_open
     except ImportError:
-        raise ImportError("read_tensors: needs safetensors: pip install unghost[torch]") from None
+        raise MissingExtra("read_tensors: needs safetensors: pip install unghost[torch]") from None
     source = Path(path)
     if not source.is_file():
-        raise ValueError(f"read_tensors: {source} does not exist or is not a file")
+        raise InvalidFile(f"read_tensors: {source} does not exist or is not a file")
     try:
         with safe_open(source, framework="pt") as opened:
             metadata = dict(opened.metadata() or {})
             return {name: opened.get_tensor(name) for name in opened.keys()}, metadata  # noqa: SIM118
     except (SafetensorError, OSError) as error:
-        raise ValueError(f"read_tensors: {source} is truncated or not a safetensors file ({error})") from None
+        raise InvalidFile(f"read_tensors: {source} is truncated or not a safetensors file ({error})") from None
 
 
 class TorchDenoiser:
@@ -65,7 +66,7 @@ class TorchDenoiser:
 
     def __init__(self, network: AnyNetwork, manifest: Manifest) -> None:
         if manifest.channels != network.config.channels:
-            raise ValueError(
+            raise InvalidArgument(
                 f"TorchDenoiser: the manifest names the channels {manifest.channels}, "
                 f"the network takes {network.config.channels}"
             )
@@ -98,16 +99,16 @@ class TorchDenoiser:
         count = (len(channels),)
         times = torch.as_tensor(timestep, device=device)
         if times.is_floating_point() or times.dtype == torch.bool:
-            raise TypeError(f"TorchDenoiser: timestep must be an integer, got dtype {times.dtype}")
+            raise InvalidType(f"TorchDenoiser: timestep must be an integer, got dtype {times.dtype}")
         if bool(((times < 0) | (times >= TIMESTEPS)).any()):
-            raise ValueError(
+            raise InvalidArgument(
                 f"TorchDenoiser: timestep must lie in [0, {TIMESTEPS}), got {times.min()} .. {times.max()}"
             )
         edges = torch.as_tensor(edge_fraction, device=device, dtype=torch.float32)
         if not bool((torch.isfinite(edges) & (edges > 0)).all()):
-            raise ValueError("TorchDenoiser: edge_fraction must be finite and > 0")
+            raise InvalidArgument("TorchDenoiser: edge_fraction must be finite and > 0")
         if not bool(torch.isfinite(channels).all()):
-            raise ValueError("TorchDenoiser: channels must be finite")
+            raise InvalidArgument("TorchDenoiser: channels must be finite")
         times = times.expand(count) if times.ndim == 0 else times
         edges = edges.expand(count) if edges.ndim == 0 else edges
         x0_pred: Tensor = self.network(channels.to(device, torch.float32), times, edges).to(channels.device)
@@ -121,7 +122,7 @@ def save_model(path: str | Path, network: AnyNetwork, manifest: Manifest, *, hal
     float32 with either.
     """
     if manifest.channels != network.config.channels:
-        raise ValueError(
+        raise InvalidArgument(
             f"save_model: the manifest names the channels {manifest.channels}, "
             f"the network takes {network.config.channels}"
         )
@@ -133,19 +134,19 @@ def save_model(path: str | Path, network: AnyNetwork, manifest: Manifest, *, hal
 def network_from_tensors(tensors: Mapping[str, Tensor], metadata: Mapping[str, str], *, origin: str) -> AnyNetwork:
     """Build the network that ``metadata`` describes and fill it; ``origin`` names the file in errors."""
     if CONFIG_KEY not in metadata:
-        raise ValueError(f"{origin}: not an unghost checkpoint (its header has no {CONFIG_KEY!r})")
+        raise InvalidFile(f"{origin}: not an unghost checkpoint (its header has no {CONFIG_KEY!r})")
     try:
         config = config_from_dict(json.loads(metadata[CONFIG_KEY]))
     except (ValueError, TypeError) as error:
-        raise ValueError(f"{origin}: its network configuration is not readable ({error})") from None
+        raise InvalidFile(f"{origin}: its network configuration is not readable ({error})") from None
     network = build_network(config)
     try:
         network.load_state_dict(dict(tensors))
     except RuntimeError as error:
-        raise ValueError(f"{origin}: its weights do not fit its configuration ({error})") from None
+        raise InvalidFile(f"{origin}: its weights do not fit its configuration ({error})") from None
     bad = [name for name, value in tensors.items() if not bool(torch.isfinite(value).all())]
     if bad:
-        raise ValueError(f"{origin}: weights are not finite in {bad}")
+        raise InvalidFile(f"{origin}: weights are not finite in {bad}")
     return network
 
 
@@ -157,9 +158,9 @@ def load_model(path: str | Path, *, device: torch.device | str = "cpu") -> Torch
     """
     tensors, metadata = read_tensors(path)
     if METADATA_KEY not in metadata:
-        raise ValueError(f"load_model: {path} is not an unghost checkpoint (its header has no {METADATA_KEY!r})")
+        raise InvalidFile(f"load_model: {path} is not an unghost checkpoint (its header has no {METADATA_KEY!r})")
     manifest = Manifest.from_json(metadata[METADATA_KEY], origin=str(path))
     network = network_from_tensors(tensors, metadata, origin=str(path))
     if manifest.channels != network.config.channels:
-        raise ValueError(f"{path}: its manifest and its network disagree on the channels")
+        raise InvalidFile(f"{path}: its manifest and its network disagree on the channels")
     return TorchDenoiser(network.to(device), manifest)

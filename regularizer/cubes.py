@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..core.aabb import scene_extent
+from ..core.errors import InvalidArgument
 from ..core.frames import random_rotations, unit_lattice
 from .proposals import ImportanceGrid, sample_edges
 from .settings import RegularizerSettings
@@ -83,7 +84,7 @@ def draw_cubes(
     if pitch is not None:
         pitch = np.broadcast_to(np.asarray(pitch, dtype=np.float64), (count,))
         if not (np.isfinite(pitch) & (pitch > 0)).all():
-            raise ValueError("DensityRegularizer: field_pitch must be finite and > 0 at every cube centre")
+            raise InvalidArgument("DensityRegularizer: field_pitch must be finite and > 0 at every cube centre")
     edges = sample_edges(rng, count, aabb=box, edge_range=settings.edge_range, field_pitch=pitch, resolution=resolution)
     rotations = random_rotations(rng, count) if settings.rotate else None
     spread: Any = 1.0 if rotations is None else np.abs(rotations).sum(axis=2)

@@ -11,12 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..core.config import override
+from ..core.errors import InvalidArgument, InvalidType, MissingExtra
 
 try:
     import torch
     from torch import Tensor
 except ImportError as error:  # pragma: no cover - exercised in a subprocess
-    raise ImportError("unghost.regularizer.density_regularizer needs torch: pip install unghost[torch]") from error
+    raise MissingExtra("unghost.regularizer.density_regularizer needs torch: pip install unghost[torch]") from error
 
 from ..cleaning.denoiser_calls import check_denoiser, run_denoiser
 from ..cleaning.grid_channels import viewing_cameras
@@ -100,19 +101,19 @@ class DensityRegularizer:
         self.aabb = as_aabb(aabb, caller="DensityRegularizer")
         self.denoiser = check_denoiser(denoiser, caller="DensityRegularizer")
         if field_pitch is not None and not callable(field_pitch) and not 0 < field_pitch < np.inf:
-            raise ValueError(f"DensityRegularizer: field_pitch must be finite and > 0, got {field_pitch}")
+            raise InvalidArgument(f"DensityRegularizer: field_pitch must be finite and > 0, got {field_pitch}")
         self.field_pitch, self.device, self.cameras = field_pitch, device, cameras
         s = self.settings
         self.threshold = denoiser.manifest.removal_threshold if s.threshold is None else s.threshold
         self.fill_threshold = max(self.threshold, SURE) if s.fill_threshold is None else s.fill_threshold
         if self.fill_threshold < self.threshold:
-            raise ValueError(
+            raise InvalidArgument(
                 f"DensityRegularizer: fill_threshold must be >= threshold={self.threshold}, got {self.fill_threshold}"
             )
         self.grid = ImportanceGrid(self.aabb, resolution=s.grid_resolution, decay=s.grid_decay)
         self._views: ViewCounter | None = None
         if depth_maps is not None and cameras is None:
-            raise ValueError("DensityRegularizer: depth_maps must come with cameras, got cameras=None")
+            raise InvalidArgument("DensityRegularizer: depth_maps must come with cameras, got cameras=None")
         if cameras is not None and len(cameras):
             warn_if_turned_away(cameras, self.aabb, caller="DensityRegularizer")
             reach = grow_box(self.aabb, s.visibility_reach)
@@ -141,10 +142,10 @@ class DensityRegularizer:
             list(density_fn) if isinstance(density_fn, (Sequence, torch.nn.ModuleList)) else [density_fn]
         )
         if not fields:
-            raise ValueError("DensityRegularizer: density_fn must be a callable or a non-empty list of them")
+            raise InvalidArgument("DensityRegularizer: density_fn must be a callable or a non-empty list of them")
         for field in fields:
             if not callable(field):
-                raise TypeError(f"DensityRegularizer: density_fn must be callable, got {type(field).__name__}")
+                raise InvalidType(f"DensityRegularizer: density_fn must be callable, got {type(field).__name__}")
         device = torch.device(self.device if self.device is not None else field_device(fields[0]) or "cpu")
         self.report = Counter()
         if self.step % self.settings.every:
@@ -164,7 +165,7 @@ class DensityRegularizer:
             kind: which of the two.
         """
         if kind not in ("density", "weight"):
-            raise ValueError(f"DensityRegularizer.observe: kind must be 'density' or 'weight', got {kind!r}")
+            raise InvalidArgument(f"DensityRegularizer.observe: kind must be 'density' or 'weight', got {kind!r}")
         amounts, points = _as_float64(values), _as_float64(positions)
         if kind == "density" and self.settings.rule.kind == "opacity":
             valid = np.where(np.isfinite(amounts) & (amounts >= 0), amounts, 0.0)
@@ -178,7 +179,7 @@ class DensityRegularizer:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Inverse of :meth:`state_dict`."""
         if np.shape(state["values"]) != self.grid.values.shape:
-            raise ValueError(
+            raise InvalidArgument(
                 f"DensityRegularizer.load_state_dict: values must have shape {self.grid.values.shape}, "
                 f"got {np.shape(state['values'])}"
             )

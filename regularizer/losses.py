@@ -9,12 +9,14 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+from ..core.errors import InvalidArgument, MissingExtra
+
 try:
     import torch
     from torch import Tensor
     from torch.autograd.function import once_differentiable
 except ImportError as error:  # pragma: no cover - exercised in a subprocess
-    raise ImportError("unghost.regularizer.losses needs torch: pip install unghost[torch]") from error
+    raise MissingExtra("unghost.regularizer.losses needs torch: pip install unghost[torch]") from error
 
 from ..core.arrays import upcast, widest
 from ..core.occupancy import DECISION
@@ -54,10 +56,10 @@ def dsds_loss(
         [3.0, 1.5, 0.0]
     """
     if x0_pred.shape != density.shape:
-        raise ValueError(f"dsds_loss: x0_pred must have shape {tuple(density.shape)}, got {tuple(x0_pred.shape)}")
+        raise InvalidArgument(f"dsds_loss: x0_pred must have shape {tuple(density.shape)}, got {tuple(x0_pred.shape)}")
     fill = threshold if fill_threshold is None else fill_threshold
     if not (math.isfinite(threshold) and math.isfinite(fill) and fill >= threshold):
-        raise ValueError(f"dsds_loss: fill_threshold must be finite and >= threshold={threshold}, got {fill}")
+        raise InvalidArgument(f"dsds_loss: fill_threshold must be finite and >= threshold={threshold}, got {fill}")
     values, prediction = upcast(density), x0_pred.detach()
     target = _target(target_density, values)
     penalty = torch.where(prediction < threshold, values, torch.zeros_like(values))
@@ -68,11 +70,11 @@ def _target(target_density: float | Tensor, density: Tensor) -> Tensor:
     """``w`` as a tensor beside ``density``, refusing anything that would broadcast by accident."""
     if not isinstance(target_density, Tensor):
         if not (math.isfinite(target_density) and target_density >= 0):
-            raise ValueError(f"dsds_loss: target_density must be finite and >= 0, got {target_density}")
+            raise InvalidArgument(f"dsds_loss: target_density must be finite and >= 0, got {target_density}")
         return density.new_tensor(target_density)
     per_cube = (len(density), *[1] * (density.ndim - 1)) if density.ndim else ()
     if tuple(target_density.shape) not in ((), per_cube, tuple(density.shape)):
-        raise ValueError(
+        raise InvalidArgument(
             f"dsds_loss: target_density must be a number or have shape {per_cube}, got {tuple(target_density.shape)}"
         )
     return target_density.detach().to(density)
@@ -97,11 +99,11 @@ def visibility_loss(density: Tensor, view_count: Tensor, *, min_views: int = 1) 
         [2.0, 0.0]
     """
     if view_count.shape != density.shape:
-        raise ValueError(
+        raise InvalidArgument(
             f"visibility_loss: view_count must have shape {tuple(density.shape)}, got {tuple(view_count.shape)}"
         )
     if min_views < 1:
-        raise ValueError(f"visibility_loss: min_views must be >= 1, got {min_views}")
+        raise InvalidArgument(f"visibility_loss: min_views must be >= 1, got {min_views}")
     values = upcast(density)
     return torch.where(view_count < min_views, values, torch.zeros_like(values))
 

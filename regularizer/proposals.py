@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core.aabb import as_aabb, scene_extent
 from ..core.arrays import to_numpy
+from ..core.errors import InvalidArgument
 from ..core.frames import RESOLUTION
 
 FloatArray = NDArray[np.float64]
@@ -39,9 +40,9 @@ class ImportanceGrid:
 
     def __init__(self, aabb: ArrayLike, *, resolution: int = GRID_RESOLUTION, decay: float = 0.9) -> None:
         if resolution < 1:
-            raise ValueError(f"ImportanceGrid: resolution must be >= 1, got {resolution}")
+            raise InvalidArgument(f"ImportanceGrid: resolution must be >= 1, got {resolution}")
         if not 0.0 <= decay < 1.0:
-            raise ValueError(f"ImportanceGrid: decay must lie in [0, 1), got {decay}")
+            raise InvalidArgument(f"ImportanceGrid: decay must lie in [0, 1), got {decay}")
         self.aabb = as_aabb(aabb, caller="ImportanceGrid")
         self.resolution, self.decay = int(resolution), float(decay)
         self.values = np.zeros((resolution,) * 3)
@@ -80,14 +81,14 @@ class ImportanceGrid:
             or points.shape[-1] != 3
             or amounts.shape not in (points.shape[:-1], (*points.shape[:-1], 1))
         ):
-            raise ValueError(
+            raise InvalidArgument(
                 f"ImportanceGrid.observe: positions (..., 3) and values (...) must match, "
                 f"got {points.shape} and {amounts.shape}"
             )
         points, amounts = points.reshape(-1, 3), amounts.reshape(-1)
         bad = ~(np.isfinite(amounts) & (amounts >= 0))
         if bad.any():
-            raise ValueError(
+            raise InvalidArgument(
                 f"ImportanceGrid.observe: values must be finite and >= 0, got {int(bad.sum())} of {bad.size} "
                 f"that are not; first {amounts[bad][0]}"
             )
@@ -122,9 +123,9 @@ class ImportanceGrid:
         """
         shares = {"mixed": uniform_share, "importance": 0.0, "uniform": 1.0}
         if strategy not in shares:
-            raise ValueError(f"ImportanceGrid.sample: strategy must be one of {sorted(shares)}, got {strategy!r}")
+            raise InvalidArgument(f"ImportanceGrid.sample: strategy must be one of {sorted(shares)}, got {strategy!r}")
         if not 0.0 <= uniform_share <= 1.0:
-            raise ValueError(f"ImportanceGrid.sample: uniform_share must lie in [0, 1], got {uniform_share}")
+            raise InvalidArgument(f"ImportanceGrid.sample: uniform_share must lie in [0, 1], got {uniform_share}")
         total = self.values.sum()
         uniform = self.aabb[0] + rng.random((count, 3)) * (self.aabb[1] - self.aabb[0])
         if total <= 0.0:
@@ -167,6 +168,6 @@ def sample_edges(
         unit = scene_extent(aabb)
         low, high = PAPER_EDGE_FRACTIONS if edge_range is None else edge_range
     if not (0.0 < low <= high and np.isfinite(high)):
-        raise ValueError(f"sample_edges: edge_range must satisfy 0 < low <= high, got {(low, high)}")
+        raise InvalidArgument(f"sample_edges: edge_range must satisfy 0 < low <= high, got {(low, high)}")
     edges: FloatArray = np.exp(rng.uniform(np.log(low), np.log(high), count)) * unit
     return edges

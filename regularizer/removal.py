@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.errors import InvalidArgument, InvalidType, MissingExtra
+
 try:
     import torch
     from torch import Tensor
 except ImportError as error:  # pragma: no cover - exercised in a subprocess
-    raise ImportError("unghost.regularizer.removal needs torch: pip install unghost[torch]") from error
+    raise MissingExtra("unghost.regularizer.removal needs torch: pip install unghost[torch]") from error
 
 from ..cleaning.keep_mask import KeepMask
 from ..cleaning.queries import field_device
@@ -75,7 +77,7 @@ class RemovalLoss:
             ("chunk", chunk, chunk >= 1, ">= 1"),
         ):
             if not holds:
-                raise ValueError(f"{CALLER}: {name} must be {rule}, got {value!r}")
+                raise InvalidArgument(f"{CALLER}: {name} must be {rule}, got {value!r}")
         self.mask, self.weight, self.samples, self.seed = mask, weight, samples, seed
         self.device, self.chunk, self.drop_invalid = device, chunk, drop_invalid
         self.step = 0
@@ -97,7 +99,9 @@ class RemovalLoss:
         several = isinstance(density_fn, (Sequence, torch.nn.ModuleList))
         fields: list[Any] = list(density_fn) if several else [density_fn]  # type: ignore[arg-type]
         if not fields or not all(callable(field) for field in fields):
-            raise TypeError(f"{CALLER}: density_fn must be a callable or a non-empty list of them, got {density_fn!r}")
+            raise InvalidType(
+                f"{CALLER}: density_fn must be a callable or a non-empty list of them, got {density_fn!r}"
+            )
         device = torch.device(self.device if self.device is not None else field_device(fields[0]) or "cpu")
         total = widest(torch.zeros((), device=device))
         points = self._points() if self.weight > 0 and len(self._removed) else np.zeros((0, 3), dtype=np.float32)

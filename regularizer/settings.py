@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from ..core.errors import InvalidArgument
 from ..core.occupancy import OccupancyRule
 from ..core.schedule import check_timestep
 from .proposals import Strategy
@@ -115,7 +116,7 @@ class RegularizerSettings:
         }
         for name, (holds, rule) in rules.items():
             if not holds:
-                raise ValueError(f"DensityRegularizer: {name} must be {rule}, got {getattr(self, name)!r}")
+                raise InvalidArgument(f"DensityRegularizer: {name} must be {rule}, got {getattr(self, name)!r}")
         if self.timestep is not None and not callable(self.timestep):
             check_timestep(self.timestep, caller="DensityRegularizer")
 

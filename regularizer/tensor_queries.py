@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ..core.arrays import upcast
+from ..core.errors import InvalidArgument, InvalidType
 from ..core.occupancy import check_density, check_density_shape
 
 DensityFn = Callable[[Any], Any]
@@ -55,11 +56,11 @@ def query_tensors(
 def _as_densities(density: Any, positions: Tensor, caller: str) -> Tensor:
     """What a callable returned for ``positions (M, 3)``, as ``(M,)``, at least float32, or an error that names it."""
     if not isinstance(density, Tensor):
-        raise TypeError(f"{caller}: density_fn must return a torch tensor, got {type(density).__name__}")
+        raise InvalidType(f"{caller}: density_fn must return a torch tensor, got {type(density).__name__}")
     if not density.is_floating_point():
-        raise TypeError(f"{caller}: density_fn must return floating-point densities, got {density.dtype}")
+        raise InvalidType(f"{caller}: density_fn must return floating-point densities, got {density.dtype}")
     if density.device != positions.device:
-        raise ValueError(
+        raise InvalidArgument(
             f"{caller}: density_fn must return densities on the device of its positions, "
             f"{positions.device}, got {density.device}"
         )

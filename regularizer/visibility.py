@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core.aabb import as_aabb
 from ..core.cameras import Cameras
+from ..core.errors import InvalidArgument
 from .view_grid import OPEN, ViewGrid
 
 FloatArray = NDArray[np.float64]
@@ -21,7 +22,7 @@ def grow_box(aabb: ArrayLike, reach: float) -> FloatArray:
     """The box ``reach`` times as wide about its centre; ``reach`` >= 1."""
     box = as_aabb(aabb, caller="grow_box")
     if not (np.isfinite(reach) and reach >= 1.0):
-        raise ValueError(f"grow_box: reach must be finite and >= 1, got {reach}")
+        raise InvalidArgument(f"grow_box: reach must be finite and >= 1, got {reach}")
     middle, half = box.mean(axis=0), (box[1] - box[0]) / 2
     return np.stack([middle - half * reach, middle + half * reach])
 
@@ -71,9 +72,9 @@ def visibility_points(
     box = as_aabb(aabb, caller="visibility_points")
     shares = {"mixed": 0.5, "rays": 1.0, "uniform": 0.0}
     if kind not in shares:
-        raise ValueError(f"visibility_points: kind must be one of {sorted(shares)}, got {kind!r}")
+        raise InvalidArgument(f"visibility_points: kind must be one of {sorted(shares)}, got {kind!r}")
     if len(cameras) == 0:
-        raise ValueError("visibility_points: cameras must not be empty")
+        raise InvalidArgument("visibility_points: cameras must not be empty")
     n_ray_points = round(shares[kind] * count)
     uniform = box[0] + rng.random((count - n_ray_points, 3)) * (box[1] - box[0])
     if n_ray_points == 0:
@@ -107,10 +108,10 @@ class ViewCounter:
         tolerance: float = 0.05,
     ) -> None:
         if min_views < 1:
-            raise ValueError(f"ViewCounter: min_views must be >= 1, got {min_views}")
+            raise InvalidArgument(f"ViewCounter: min_views must be >= 1, got {min_views}")
         shape = (len(cameras), cameras.height, cameras.width)
         if depth_maps is not None and np.shape(depth_maps) != shape:
-            raise ValueError(f"ViewCounter: depth_maps must have shape {shape}, got {np.shape(depth_maps)}")
+            raise InvalidArgument(f"ViewCounter: depth_maps must have shape {shape}, got {np.shape(depth_maps)}")
         self.min_views, self.tolerance = int(min_views), tolerance
         self._depth = None if depth_maps is None else np.asarray(depth_maps)
         box = None if aabb is None else as_aabb(aabb, caller="ViewCounter")
@@ -122,7 +123,7 @@ class ViewCounter:
         """``min(view count, min_views)`` for ``positions (N, 3)``; ``(N,)``."""
         points = np.asarray(positions, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != 3:
-            raise ValueError(f"ViewCounter: positions must have shape (N, 3), got {points.shape}")
+            raise InvalidArgument(f"ViewCounter: positions must have shape (N, 3), got {points.shape}")
         counts = np.zeros(len(points), dtype=np.int64)
         open_ = np.arange(len(points))
         if self._grid is not None:

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..core.errors import InvalidArgument
 from .ply import Gaussians
 
 CUT = 3.0  # standard deviations; beyond, a splat counts as nothing
@@ -59,7 +60,7 @@ class SplatField:
             ValueError: ``pitch`` is not finite and > 0.
         """
         if not 0.0 < pitch < np.inf:
-            raise ValueError(f"SplatField: pitch must be finite and > 0, got {pitch}")
+            raise InvalidArgument(f"SplatField: pitch must be finite and > 0, got {pitch}")
         self.pitch = float(pitch)
         spread = np.sqrt(gaussians.extents**2 + (pitch / 2) ** 2)
         self._means = gaussians.means
@@ -74,7 +75,7 @@ class SplatField:
         """Density ``(..., 1)`` per scene unit at ``positions (..., 3)``, scene units; NaN where one is not finite."""
         points = np.asarray(positions, dtype=np.float64)
         if points.shape[-1:] != (3,):
-            raise ValueError(f"SplatField.density_fn: positions must have shape (..., 3), got {points.shape}")
+            raise InvalidArgument(f"SplatField.density_fn: positions must have shape (..., 3), got {points.shape}")
         flat = points.reshape(-1, 3)
         total = np.zeros(len(flat))
         finite = np.asarray(np.isfinite(flat).all(axis=1))

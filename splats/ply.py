@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..core.errors import InvalidArgument, InvalidFile, MissingFile
 from ..core.io import atomic_file
 from ..core.ply_types import PLY_TYPES
 
@@ -80,7 +81,7 @@ class Gaussians:
         place, sides, turns, logit = (np.asarray(a, dtype=np.float64) for a in (means, extents, quaternions, logits))
         count = len(place)
         if (place.shape, sides.shape, turns.shape, logit.shape) != ((count, 3), (count, 3), (count, 4), (count,)):
-            raise ValueError(
+            raise InvalidArgument(
                 "Gaussians: means, extents, quaternions, logits must have shapes (N, 3), (N, 3), (N, 4), (N,), got "
                 f"{place.shape}, {sides.shape}, {turns.shape}, {logit.shape}"
             )
@@ -88,7 +89,7 @@ class Gaussians:
         good = np.isfinite(np.column_stack([place, turns, logit])).all(axis=1) & (length > 0)
         good &= ((sides > 0) & (sides < MOST_EXTENT)).all(axis=1)
         if not good.all():
-            raise ValueError(
+            raise InvalidArgument(
                 f"Gaussians: means, rotations and opacity must be finite, extents in (0, {MOST_EXTENT}); "
                 f"{int((~good).sum())} of {count} are not, the first is number {int(np.argmin(good))}"
             )
@@ -113,9 +114,9 @@ class Gaussians:
         A capture's last per cent are splats of the far background; a box around them would be mostly empty.
         """
         if not 0.0 < share <= 1.0:
-            raise ValueError(f"Gaussians.aabb: share must lie in (0, 1], got {share}")
+            raise InvalidArgument(f"Gaussians.aabb: share must lie in (0, 1], got {share}")
         if len(self) == 0:
-            raise ValueError("Gaussians.aabb: there are no Gaussians")
+            raise InvalidArgument("Gaussians.aabb: there are no Gaussians")
         weight = self.opacity()
         box = np.empty((2, 3))
         for axis in range(3):
@@ -149,7 +150,7 @@ def read_splat_ply(path: str | Path) -> SplatPly:
     """
     source = Path(path)
     if not source.is_file():
-        raise FileNotFoundError(f"read_splat_ply: no file {source}")
+        raise MissingFile(f"read_splat_ply: no file {source}")
 
     def refuse(rule: str) -> ValueError:
         return ValueError(f"read_splat_ply: {source} is not a PLY of Gaussian splats: {rule}")
@@ -192,11 +193,11 @@ def _layout(lines: tuple[str, ...]) -> tuple[int, np.dtype[np.void]]:
         elif words[0] == "property" and len(words) == 3 and words[1] in PLY_TYPES and count >= 0 and len(fields) < 512:
             fields.append((words[2], f"<{PLY_TYPES[words[1]]}"))
         else:
-            raise ValueError(
+            raise InvalidFile(
                 f"the header's line {line[:60]!r} (wanted: binary_little_endian, one element, plain numbers)"
             )
     if not order or count < 0 or len({name for name, _ in fields}) != len(fields) or not fields:
-        raise ValueError("its header names no format, no vertices, no properties, or one twice")
+        raise InvalidFile("its header names no format, no vertices, no properties, or one twice")
     return count, np.dtype(fields)
 
 
@@ -229,12 +230,12 @@ def write_splat_ply(
     target = Path(path)
     for name, array in (("keep", keep), ("keep_score", keep_score)):
         if array is not None and array.shape != (len(splats),):
-            raise ValueError(f"write_splat_ply: {name} must have shape ({len(splats)},), got {array.shape}")
+            raise InvalidArgument(f"write_splat_ply: {name} must have shape ({len(splats)},), got {array.shape}")
     if keep.dtype != np.bool_:
-        raise ValueError(f"write_splat_ply: keep must be bool, got {keep.dtype}")
+        raise InvalidArgument(f"write_splat_ply: keep must be bool, got {keep.dtype}")
     origin = getattr(splats.rows, "filename", None)
     if origin is not None and target.exists() and target.samefile(origin):
-        raise ValueError(f"write_splat_ply: {target} is the file that is being read; write to another")
+        raise InvalidArgument(f"write_splat_ply: {target} is the file that is being read; write to another")
     names = [name for name in splats.rows.dtype.names or () if keep_score is None or name != KEEP_SCORE]
     fields = [(name, splats.rows.dtype[name]) for name in names]
     if keep_score is not None:

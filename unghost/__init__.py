@@ -18,12 +18,14 @@ if TYPE_CHECKING:
     from .cleaning.splats import CleanedSplats as CleanedSplats
     from .cleaning.strength import choose_strength as choose_strength
     from .core.cameras import Cameras as Cameras
+    from .core.errors import UnghostError as UnghostError
     from .core.occupancy import OccupancyRule as OccupancyRule
     from .denoisers import load_denoiser as load_denoiser
     from .denoisers import shipped_names as shipped_names
     from .evaluation.captures.loading import Capture as Capture
     from .evaluation.captures.loading import load_cameras as load_cameras
     from .evaluation.captures.loading import load_capture as load_capture
+    from .evaluation.scoring.evaluation import evaluate as evaluate
     from .evaluation.uncertainty.photometric import photo_doubt as photo_doubt
     from .facade.cleaning import clean as clean
     from .facade.cleaning import clean_splats as clean_splats
@@ -46,9 +48,11 @@ __getattr__, __dir__, __all__ = attach(
         ".cleaning.splats": ["CleanedSplats"],
         ".cleaning.strength": ["choose_strength"],
         ".core.cameras": ["Cameras"],
+        ".core.errors": ["UnghostError"],
         ".core.occupancy": ["OccupancyRule"],
         ".denoisers": ["load_denoiser", "shipped_names"],
         ".evaluation.captures.loading": ["Capture", "load_cameras", "load_capture"],
+        ".evaluation.scoring.evaluation": ["evaluate"],
         ".evaluation.uncertainty.photometric": ["photo_doubt"],
         ".facade.cleaning": ["clean", "clean_splats"],
         ".facade.regularization": ["DensityRegularizer"],

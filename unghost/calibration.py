@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .core.errors import InvalidArgument
+
 if TYPE_CHECKING:
     from .core.manifest import Manifest
     from .export.onnx.parity import ParityInputs
@@ -28,7 +30,7 @@ def calibration_for(checkpoint: str | Path, source: str | Path, *, cubes: int, s
     from .export.onnx.quantization import calibration_inputs
 
     if cubes < 1:
-        raise ValueError(f"calibration_for: cubes must be >= 1, got {cubes}")
+        raise InvalidArgument(f"calibration_for: cubes must be >= 1, got {cubes}")
     manifest = _manifest(Path(checkpoint))
     names, stored = manifest.channels, Path(source).is_dir()
     channels, edges = _stored(Path(source), cubes, names) if stored else _made(source, cubes, seed, names)

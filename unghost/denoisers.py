@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from .core.errors import InvalidArgument, MissingExtra, MissingFile
 from .core.manifest import Denoiser
 
 WEIGHTS = Path(__file__).resolve().parent / "weights"
@@ -25,9 +26,9 @@ def _load_torch(path: Path, threads: int | None) -> Denoiser:
     except ModuleNotFoundError as error:
         if error.name not in ("torch", "safetensors"):
             raise
-        raise ImportError(f"load_denoiser: backend 'torch' needs {error.name}: pip install unghost[torch]") from error
+        raise MissingExtra(f"load_denoiser: backend 'torch' needs {error.name}: pip install unghost[torch]") from error
     if threads is not None:
-        raise ValueError("load_denoiser: threads is for backend 'onnx'; torch takes torch.set_num_threads")
+        raise InvalidArgument("load_denoiser: threads is for backend 'onnx'; torch takes torch.set_num_threads")
     return load_model(path)
 
 
@@ -66,13 +67,15 @@ def load_denoiser(
         ('signed_opacity',)
     """
     if backend is not None and backend not in _LOADERS:
-        raise ValueError(f"load_denoiser: backend must be one of {sorted(_LOADERS)}, got {backend!r}")
+        raise InvalidArgument(f"load_denoiser: backend must be one of {sorted(_LOADERS)}, got {backend!r}")
     path = Path(name_or_path)
     engine_of = {suffix: name for name, suffix in SUFFIXES.items()}
     if path.suffix in engine_of:
         implied = engine_of[path.suffix]
         if backend not in (None, implied):
-            raise ValueError(f"load_denoiser: backend {backend!r} reads {SUFFIXES[str(backend)]} files, got {path}")
+            raise InvalidArgument(
+                f"load_denoiser: backend {backend!r} reads {SUFFIXES[str(backend)]} files, got {path}"
+            )
         backend = implied
     else:
         backend = backend or "onnx"
@@ -80,7 +83,7 @@ def load_denoiser(
     if not path.is_file():
         successor = SUCCESSORS.get(str(name_or_path))
         retired = f" (no longer shipped: {successor!r} replaces it)" if successor else ""
-        raise FileNotFoundError(
+        raise MissingFile(
             f"load_denoiser: no file {path.name if path.parent == WEIGHTS else path} for {str(name_or_path)!r}"
             f"{retired}; shipped names: {', '.join(shipped_names()) or 'none'}, or give the path of an .onnx or "
             ".safetensors file"

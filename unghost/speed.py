@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from .core.distances.signed import sphere
+from .core.errors import InvalidArgument
 from .core.frames import RESOLUTION, unit_lattice
 
 WARM_UP = 3
@@ -39,7 +40,7 @@ def measure_speed(denoiser: Any, *, batch: int = 40, seconds: float = 5.0, seed:
         ValueError: an argument out of range, or an output that is not a denoiser's.
     """
     if batch < 1 or not seconds > 0:
-        raise ValueError(f"measure_speed: batch must be >= 1 and seconds > 0, got {batch} and {seconds}")
+        raise InvalidArgument(f"measure_speed: batch must be >= 1 and seconds > 0, got {batch} and {seconds}")
     channels = sample_channels(batch, len(denoiser.manifest.channels), seed=seed)
     durations: list[float] = []
     begun = 0.0
@@ -50,7 +51,7 @@ def measure_speed(denoiser: Any, *, batch: int = 40, seconds: float = 5.0, seed:
         x0_pred = denoiser(channels, denoiser.manifest.default_timestep, 0.1)
         durations.append(time.perf_counter() - start)
         if x0_pred.shape != (batch, 1, *(RESOLUTION,) * 3) or not (np.abs(x0_pred) <= 1.0 + 1e-5).all():
-            raise ValueError(f"measure_speed: x0_pred must be (N, 1, 32, 32, 32) in [-1, 1], got {x0_pred.shape}")
+            raise InvalidArgument(f"measure_speed: x0_pred must be (N, 1, 32, 32, 32) in [-1, 1], got {x0_pred.shape}")
         if call >= WARM_UP + 4 and time.perf_counter() - begun > seconds:
             break
     median = statistics.median(durations[WARM_UP:])

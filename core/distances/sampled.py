@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import InvalidArgument
 from ..interpolate import interpolate_grid
 
 Array = NDArray[Any]
@@ -32,12 +33,14 @@ class SampledDistance:
     def __post_init__(self) -> None:
         shape = self.values.shape
         if len(shape) != 3 or min(shape) < 2:
-            raise ValueError(f"SampledDistance: values must have shape (X, Y, Z) with 2 nodes or more, got {shape}")
+            raise InvalidArgument(
+                f"SampledDistance: values must have shape (X, Y, Z) with 2 nodes or more, got {shape}"
+            )
         if not (np.isfinite(self.values).all() and 0 < self.pitch < np.inf):
-            raise ValueError(f"SampledDistance: values must be finite and pitch > 0, got pitch {self.pitch}")
+            raise InvalidArgument(f"SampledDistance: values must be finite and pitch > 0, got pitch {self.pitch}")
         sides = [self.values.take(end, axis=axis).min() for axis in range(3) for end in (0, -1)]
         if min(sides) <= 0:
-            raise ValueError(f"SampledDistance: values must be > 0 on the sides of the grid, got {min(sides)}")
+            raise InvalidArgument(f"SampledDistance: values must be > 0 on the sides of the grid, got {min(sides)}")
 
     @property
     def bound(self) -> float:
@@ -51,7 +54,7 @@ class SampledDistance:
     def scaled(self, factor: float) -> SampledDistance:
         """The same solid ``factor`` times as large."""
         if not 0 < factor < np.inf:
-            raise ValueError(f"scaled: factor must be finite and > 0, got {factor}")
+            raise InvalidArgument(f"scaled: factor must be finite and > 0, got {factor}")
         return SampledDistance(self.values * np.float32(factor), self.low * factor, self.pitch * factor)
 
     def __call__(self, positions: Array) -> Array:

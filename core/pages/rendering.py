@@ -7,6 +7,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..errors import InvalidArgument, MissingExtra
 from .charts import percent, series_class
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ def environment() -> Environment:
     try:
         from jinja2 import Environment, FileSystemLoader, StrictUndefined
     except ImportError as error:
-        raise ImportError(
+        raise MissingExtra(
             "HTML pages need Jinja2: pip install unghost[demo], unghost[recipes] or unghost[eval]", name="jinja2"
         ) from error
     made = Environment(
@@ -63,5 +64,5 @@ def data_uri(image: bytes) -> str:
     """
     media = next((name for start, name in MEDIA_TYPES.items() if image.startswith(start)), None)
     if media is None:
-        raise ValueError(f"data_uri: image must be a PNG or JPEG file, got bytes that start with {image[:8]!r}")
+        raise InvalidArgument(f"data_uri: image must be a PNG or JPEG file, got bytes that start with {image[:8]!r}")
     return f"data:{media};base64,{base64.b64encode(image).decode('ascii')}"

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
+from ..errors import InvalidArgument
+
 
 @dataclass(frozen=True)
 class Cell:
@@ -42,4 +44,4 @@ class Table:
     def __post_init__(self) -> None:
         for row in self.rows:
             if len(row) != len(self.heads):
-                raise ValueError(f"Table: every row must have {len(self.heads)} cells, got {len(row)}")
+                raise InvalidArgument(f"Table: every row must have {len(self.heads)} cells, got {len(row)}")

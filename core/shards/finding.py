@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ..errors import InvalidArgument
 from .storage import read_shard
 
 
@@ -17,14 +18,14 @@ def find_shards(folder: str | Path) -> list[Path]:
         >>> find_shards("absent")
         Traceback (most recent call last):
         ...
-        ValueError: find_shards: absent is not a shard and holds none
+        unghost.core.errors.InvalidArgument: find_shards: absent is not a shard and holds none
     """
     root = Path(folder)
     if (root / "manifest.json").is_file():
         return [root]
     found = sorted(path.parent for path in root.glob("*/manifest.json") if path.parent.suffix != ".partial")
     if not found:
-        raise ValueError(f"find_shards: {root} is not a shard and holds none")
+        raise InvalidArgument(f"find_shards: {root} is not a shard and holds none")
     return found
 
 
@@ -40,16 +41,16 @@ def expand_shards(spec: str) -> list[tuple[Path, float]]:
         >>> expand_shards("absent=-1")
         Traceback (most recent call last):
         ...
-        ValueError: expand_shards: the weight in 'absent=-1' must be finite and > 0
+        unghost.core.errors.InvalidArgument: expand_shards: the weight in 'absent=-1' must be finite and > 0
     """
     name, separator, number = spec.rpartition("=")
     folder = Path(name if separator else spec)
     try:
         weight = float(number) if separator else 1.0
     except ValueError:
-        raise ValueError(f"expand_shards: {spec!r} must be FOLDER or FOLDER=WEIGHT, the weight a number") from None
+        raise InvalidArgument(f"expand_shards: {spec!r} must be FOLDER or FOLDER=WEIGHT, the weight a number") from None
     if not 0 < weight < float("inf"):
-        raise ValueError(f"expand_shards: the weight in {spec!r} must be finite and > 0")
+        raise InvalidArgument(f"expand_shards: the weight in {spec!r} must be finite and > 0")
     found = find_shards(folder)
     if found == [folder]:
         return [(folder, weight)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import InvalidArgument
 from ..frames import RESOLUTION, CubeFrame
 from ..occupancy import IGNORE_LABEL
 
@@ -19,9 +20,9 @@ def pack_labels(labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
         labels: N may be 0; R must be even.
     """
     if labels.ndim != 4 or np.prod(labels.shape[1:]) % 4:
-        raise ValueError(f"pack_labels: labels must have shape (N, R, R, R) with an even R, got {labels.shape}")
+        raise InvalidArgument(f"pack_labels: labels must have shape (N, R, R, R) with an even R, got {labels.shape}")
     if labels.size and not 0 <= labels.min() <= labels.max() <= IGNORE_LABEL:
-        raise ValueError(f"pack_labels: labels must be 0, 1 or 2, got {labels.min()} to {labels.max()}")
+        raise InvalidArgument(f"pack_labels: labels must be 0, 1 or 2, got {labels.min()} to {labels.max()}")
     quads = labels.astype(np.uint8).reshape(len(labels), int(np.prod(labels.shape[1:])) // 4, 4)
     return (quads * np.array([1, 4, 16, 64], dtype=np.uint8)).sum(axis=-1, dtype=np.uint8)
 
@@ -29,7 +30,7 @@ def pack_labels(labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def unpack_labels(packed: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Inverse of :func:`pack_labels`: ``(N, 8192)`` bytes to ``(N, 32, 32, 32)``; N may be 0."""
     if packed.ndim != 2 or packed.shape[1] != VOXELS // 4:
-        raise ValueError(f"unpack_labels: packed must have shape (N, {VOXELS // 4}), got {packed.shape}")
+        raise InvalidArgument(f"unpack_labels: packed must have shape (N, {VOXELS // 4}), got {packed.shape}")
     quads = np.stack([packed & 3, packed >> 2 & 3, packed >> 4 & 3, packed >> 6], axis=-1)
     return quads.reshape(len(packed), RESOLUTION, RESOLUTION, RESOLUTION)
 

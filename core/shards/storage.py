@@ -16,6 +16,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import InvalidArgument, InvalidFile
 from ..frames import RESOLUTION
 from ..io import new_folder, read_json
 from .packing import FRAME_NUMBERS, VOXELS
@@ -75,7 +76,7 @@ def _check_frames(frames: NDArray[np.float64], where: str) -> None:
         products = rotations @ rotations.transpose(0, 2, 1)
     good &= np.isclose(products, np.eye(3), rtol=0, atol=1e-6).all(axis=(1, 2))
     if not good.all():
-        raise ValueError(
+        raise InvalidArgument(
             f"{where}: each row of frames must be NaN throughout or a finite center, an edge_length > 0 and an "
             f"orthonormal rotation, got {known[int(np.argmin(good))].tolist()}"
         )
@@ -84,14 +85,16 @@ def _check_frames(frames: NDArray[np.float64], where: str) -> None:
 def _check_sources(source: NDArray[np.int32], provenance: Mapping[str, Any], where: str) -> None:
     sources = provenance.get("sources")
     if not isinstance(sources, list) or not all(isinstance(entry, dict) for entry in sources):
-        raise ValueError(f"{where}: with source, provenance must hold sources, a list of objects, got {sources!r:.80}")
+        raise InvalidArgument(
+            f"{where}: with source, provenance must hold sources, a list of objects, got {sources!r:.80}"
+        )
     if len(source) and not (source.min() >= NO_SOURCE and source.max() < len(sources)):
-        raise ValueError(
+        raise InvalidArgument(
             f"{where}: source must lie in [{NO_SOURCE}, {len(sources)}), got {source.min()} to {source.max()}"
         )
     for entry in sources:
         if not stays_within(str(entry.get("path", ""))):
-            raise ValueError(
+            raise InvalidArgument(
                 f"{where}: the path of a source must be relative and stay in its folder, got {entry['path']!r}"
             )
 
@@ -99,14 +102,14 @@ def _check_sources(source: NDArray[np.int32], provenance: Mapping[str, Any], whe
 def _check_values(arrays: Mapping[str, NDArray[Any]], provenance: Mapping[str, Any], where: str) -> None:
     """The rules that values must obey, for those of the arrays that are given."""
     if "labels" in arrays and (arrays["labels"] & arrays["labels"] >> 1 & 0x55).any():
-        raise ValueError(f"{where}: labels must be 0, 1 or 2, got 3")
+        raise InvalidArgument(f"{where}: labels must be 0, 1 or 2, got 3")
     severity, fraction = arrays.get("severity", np.ones(1)), arrays.get("edge_fraction", np.ones(1))
     for name, values, good, rule in (
         ("severity", severity, (severity >= 0) & (severity <= 1), "lie in [0, 1]"),
         ("edge_fraction", fraction, (fraction > 0) & (fraction < np.inf), "be finite and > 0"),
     ):
         if not good.all():
-            raise ValueError(f"{where}: {name} must {rule}, got {values[~good][0]}")
+            raise InvalidArgument(f"{where}: {name} must {rule}, got {values[~good][0]}")
     if "frames" in arrays:
         _check_frames(arrays["frames"], where)
     if "source" in arrays:
@@ -115,7 +118,7 @@ def _check_values(arrays: Mapping[str, NDArray[Any]], provenance: Mapping[str, A
 
 def _check_kind(kind: object, where: str) -> ShardKind:
     if kind not in SHARD_KINDS:
-        raise ValueError(f"{where}: kind must be one of {', '.join(SHARD_KINDS)}, got {kind!r:.80}")
+        raise InvalidArgument(f"{where}: kind must be one of {', '.join(SHARD_KINDS)}, got {kind!r:.80}")
     return kind
 
 
@@ -153,13 +156,17 @@ def write_shard(
         raise FileExistsError(f"write_shard: {target} exists already")
     missing, unknown = sorted(set(ARRAYS) - set(arrays)), sorted(set(arrays) - set(ARRAYS) - set(OPTIONAL_ARRAYS))
     if missing or unknown:
-        raise ValueError(f"write_shard: arrays must hold {', '.join(ARRAYS)}; missing {missing}, unknown {unknown}")
+        raise InvalidArgument(
+            f"write_shard: arrays must hold {', '.join(ARRAYS)}; missing {missing}, unknown {unknown}"
+        )
     count = len(arrays["inputs"])
     layout = {name: rule for name, rule in (ARRAYS | OPTIONAL_ARRAYS).items() if name in arrays}
     for name, (shape, dtype) in layout.items():
         array = arrays[name]
         if array.shape != (count, *shape) or array.dtype != np.dtype(dtype):
-            raise ValueError(f"write_shard: {name} must be {dtype} {(count, *shape)}, got {array.dtype} {array.shape}")
+            raise InvalidArgument(
+                f"write_shard: {name} must be {dtype} {(count, *shape)}, got {array.dtype} {array.shape}"
+            )
     _check_values(arrays, provenance, "write_shard")
     try:
         with new_folder(target, unique=False) as partial:
@@ -210,18 +217,18 @@ def _read_manifest(source: Path) -> dict[str, Any]:
     try:
         manifest = read_json(source / "manifest.json", caller="read_shard")
     except FileNotFoundError:
-        raise ValueError(f"read_shard: {source} has no manifest.json: not a shard, or unfinished") from None
+        raise InvalidFile(f"read_shard: {source} has no manifest.json: not a shard, or unfinished") from None
     found = manifest if isinstance(manifest, dict) else {}
     if found.get("format") != FORMAT or found.get("format_version") != FORMAT_VERSION:
-        raise ValueError(f"read_shard: {source} is not an {FORMAT} of version {FORMAT_VERSION}")
+        raise InvalidFile(f"read_shard: {source} is not an {FORMAT} of version {FORMAT_VERSION}")
     for key, kind in (("count", int), ("sha256", dict), ("provenance", dict)):
         if not isinstance(found.get(key), kind) or isinstance(found[key], bool):
-            raise ValueError(f"read_shard: {source}/manifest.json must hold {key}, got {found.get(key)!r:.80}")
+            raise InvalidFile(f"read_shard: {source}/manifest.json must hold {key}, got {found.get(key)!r:.80}")
     missing = sorted(set(ARRAYS) - set(found["sha256"]))
     unknown = sorted(set(found["sha256"]) - set(ARRAYS) - set(OPTIONAL_ARRAYS))
     unlisted = [name for name in OPTIONAL_ARRAYS if name not in found["sha256"] and (source / f"{name}.npy").exists()]
     if missing or unknown or unlisted:
-        raise ValueError(
+        raise InvalidFile(
             f"read_shard: the arrays of {source} and the sha256 of its manifest disagree: "
             f"not named {missing + unlisted}, unknown {unknown}"
         )
@@ -236,14 +243,14 @@ def _open_array(path: Path, shape: tuple[int, ...], dtype: str) -> NDArray[Any]:
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
-        raise ValueError(f"read_shard: cannot read {path} ({error})") from None
+        raise InvalidFile(f"read_shard: cannot read {path} ({error})") from None
     if not isinstance(array, np.memmap) or not array.flags.c_contiguous:
-        raise ValueError(f"read_shard: cannot read {path} (it is not one array in C order)")
+        raise InvalidFile(f"read_shard: cannot read {path} (it is not one array in C order)")
     if array.shape != shape or array.dtype != np.dtype(dtype):
-        raise ValueError(f"read_shard: {path} holds {array.dtype} {array.shape}, the manifest says {dtype} {shape}")
+        raise InvalidFile(f"read_shard: {path} holds {array.dtype} {array.shape}, the manifest says {dtype} {shape}")
     excess = path.stat().st_size - array.offset - array.nbytes
     if excess:
-        raise ValueError(f"read_shard: {path} is {excess} bytes longer than its array")
+        raise InvalidFile(f"read_shard: {path} is {excess} bytes longer than its array")
     return array
 
 
@@ -262,7 +269,7 @@ def read_shard(folder: str | Path, *, verify: bool = False) -> Shard:
         path = source / f"{name}.npy"
         loaded[name] = _open_array(path, (manifest["count"], *shape), dtype)
         if verify and _sha256(path) != manifest["sha256"][name]:
-            raise ValueError(f"read_shard: {path} does not match the hash in its manifest")
+            raise InvalidFile(f"read_shard: {path} does not match the hash in its manifest")
     checked = {name: array for name, array in loaded.items() if verify or name == "source"}
     _check_values(checked, manifest["provenance"], f"read_shard: {source}")
     return Shard(**loaded, provenance=manifest["provenance"], kind=manifest["kind"])

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras import Cameras
+from ..errors import InvalidArgument
 from ..interpolate import interpolate_grid
 
 FAN = (32, 24)  # rays across and down a photo
@@ -61,7 +62,7 @@ class TransmittanceMaps:
             ValueError: a pitch that is not finite and > 0, or densities that are NaN or negative.
         """
         if not 0 < field_pitch < np.inf:
-            raise ValueError(f"TransmittanceMaps: field_pitch must be finite and > 0, got {field_pitch}")
+            raise InvalidArgument(f"TransmittanceMaps: field_pitch must be finite and > 0, got {field_pitch}")
         columns, rows = (
             np.unique(np.floor((np.arange(count) + 0.5) * size / count)).astype(np.int64)
             for count, size in zip(FAN, (cameras.width, cameras.height))
@@ -77,7 +78,9 @@ class TransmittanceMaps:
             parts = [np.asarray(density_fn(points[i : i + QUERY])).reshape(-1) for i in range(0, len(points), QUERY)]
             density = np.concatenate(parts).astype(np.float64).reshape(len(rows), len(columns), STEPS)
             if not (density >= 0).all():
-                raise ValueError(f"TransmittanceMaps: density must be >= 0, {int((~(density >= 0)).sum())} are not")
+                raise InvalidArgument(
+                    f"TransmittanceMaps: density must be >= 0, {int((~(density >= 0)).sum())} are not"
+                )
             depth = np.cumsum(np.minimum(density * step[index], 1e3), axis=2)
             through[index, ..., 1:] = np.exp(-depth)
         across, down = (pixels.astype(np.float64) + 0.5 for pixels in (columns, rows))

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras import Cameras, distort, largest_radius, undistort
+from ..errors import InvalidArgument
 from ..frames import RESOLUTION, cube_lattices, unit_lattice
 from ..shards.storage import MAX_VIEW_COUNT
 
@@ -23,7 +24,7 @@ def frustum_normals(cameras: Cameras) -> NDArray[np.float64]:
         ValueError: a camera has distortion; its field of view has no flat sides.
     """
     if cameras.distortion.any():
-        raise ValueError("frustum_normals: cameras must have no distortion")
+        raise InvalidArgument("frustum_normals: cameras must have no distortion")
     fx, fy, cx, cy = cameras.intrinsics.T
     zero = np.zeros_like(fx)
     local = np.array(

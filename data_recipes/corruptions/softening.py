@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.errors import InvalidArgument
 from ...core.occupancy import opacity_from_density, signed_from_occupancy, signed_from_opacity
 from ..solids.draws import log_uniform
 
@@ -133,12 +134,12 @@ def soften(
         ((32, 32, 32), True, True)
     """
     if clean.shape != corrupted.shape or clean.dtype != np.bool_ or corrupted.dtype != np.bool_:
-        raise ValueError(
+        raise InvalidArgument(
             f"soften: clean and corrupted must be boolean and of one shape, got {clean.dtype} {clean.shape} "
             f"and {corrupted.dtype} {corrupted.shape}"
         )
     if not 0.0 <= severity <= 1.0:
-        raise ValueError(f"soften: severity must lie in [0, 1], got {severity}")
+        raise InvalidArgument(f"soften: severity must lie in [0, 1], got {severity}")
     if severity == 0.0:
         return np.asarray(signed_from_occupancy(corrupted), dtype=np.float32)
     resolution, fade = clean.shape[0], min(1.0, 4.0 * severity)

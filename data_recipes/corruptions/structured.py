@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.errors import InvalidArgument
 from ..solids.compose import dilate
 from ..solids.primitives import log_uniform
 from .softening import coarse_noise, soften
@@ -44,7 +45,7 @@ def changed_fraction(severity: float) -> float:
         (0.0, True)
     """
     if not 0.0 <= severity <= 1.0:
-        raise ValueError(f"changed_fraction: severity must lie in [0, 1], got {severity}")
+        raise InvalidArgument(f"changed_fraction: severity must lie in [0, 1], got {severity}")
     return float(np.interp(severity, _SEVERITIES, _CHANGED))
 
 
@@ -57,7 +58,7 @@ def _budget(rng: np.random.Generator, occupancy: Occupancy, severity: float) -> 
 
 def _check(occupancy: Occupancy) -> None:
     if occupancy.dtype != np.bool_ or occupancy.ndim != 3 or len(set(occupancy.shape)) != 1:
-        raise ValueError(
+        raise InvalidArgument(
             f"augment: occupancy must be a boolean cube (R, R, R), got {occupancy.dtype} {occupancy.shape}"
         )
 

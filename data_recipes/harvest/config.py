@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...core.errors import InvalidArgument
+
 KINDS = ("dense", "hash", "mlp")  # of field, as fields.kinds has them
 
 
@@ -51,21 +53,27 @@ class HarvestConfig:
     def __post_init__(self) -> None:
         unknown = sorted(set(self.kinds) - set(KINDS))
         if unknown or not self.kinds or len(set(self.kinds)) < len(self.kinds):
-            raise ValueError(f"HarvestConfig: kinds must be different ones of {', '.join(KINDS)}, got {self.kinds}")
+            raise InvalidArgument(
+                f"HarvestConfig: kinds must be different ones of {', '.join(KINDS)}, got {self.kinds}"
+            )
         if len(self.shares) != len(self.kinds) or not all(0 < share < np.inf for share in self.shares):
-            raise ValueError(
+            raise InvalidArgument(
                 f"HarvestConfig: shares must be one finite number > 0 for each of {self.kinds}, got {self.shares}"
             )
         for name in ("photos", "photo_width", "steps", "voxel_pitch", "room_pitch"):
             low, high = getattr(self, name)
             if not 0 < low <= high:
-                raise ValueError(f"HarvestConfig: {name} must be (low, high) with 0 < low <= high, got {(low, high)}")
+                raise InvalidArgument(
+                    f"HarvestConfig: {name} must be (low, high) with 0 < low <= high, got {(low, high)}"
+                )
         if not 0 <= self.objects[0] <= self.objects[1]:
-            raise ValueError(f"HarvestConfig: objects must be (low, high) with 0 <= low <= high, got {self.objects}")
+            raise InvalidArgument(
+                f"HarvestConfig: objects must be (low, high) with 0 <= low <= high, got {self.objects}"
+            )
         if min(self.rays, self.cubes) < 1:
-            raise ValueError(f"HarvestConfig: rays and cubes must be >= 1, got {self.rays} and {self.cubes}")
+            raise InvalidArgument(f"HarvestConfig: rays and cubes must be >= 1, got {self.rays} and {self.cubes}")
         if self.observer_photos < 0 or self.observer_width < 4:
-            raise ValueError(
+            raise InvalidArgument(
                 "HarvestConfig: observer_photos must be >= 0 and observer_width >= 4, got "
                 f"{self.observer_photos} and {self.observer_width}"
             )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ...core.config import to_dict
+from ...core.errors import InvalidArgument
 from ...core.shards.storage import read_shard
 from .config import HarvestConfig
 
@@ -38,7 +39,7 @@ def finished(
     if told.get("meshes") and not meshes:
         differing.append("meshes: some, not none")
     if differing:
-        raise ValueError(
+        raise InvalidArgument(
             f"harvest: {target} is of another harvest ({'; '.join(differing)}): choose another out folder or remove it"
         )
     return True

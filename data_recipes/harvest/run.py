@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from ...core.aabb import scene_extent
 from ...core.channels import full_channel
 from ...core.config import to_dict
+from ...core.errors import InvalidArgument
 from ...core.frames import RESOLUTION, cube_lattices, random_rotations
 from ...core.occupancy import DEFAULT_OPACITY_THRESHOLD, opacity_from_density, opacity_from_signed
 from ...core.shards.packing import (
@@ -283,7 +284,7 @@ def harvest(
 
     folder, config = Path(out), config or HarvestConfig()
     if scenes < 1 or workers < 1:
-        raise ValueError(f"harvest: scenes and workers must be >= 1, got {scenes} and {workers}")
+        raise InvalidArgument(f"harvest: scenes and workers must be >= 1, got {scenes} and {workers}")
     started = time.perf_counter()
     root = None if mesh_root is None else str(mesh_root)
     with locked(folder, verb="harvest"):

@@ -14,6 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.errors import InvalidArgument
+
 Floats = NDArray[np.float32]
 Image = NDArray[np.uint8]
 
@@ -154,7 +156,7 @@ def render_cube(opacity: NDArray[Any], colors: NDArray[Any], *, width: int = 168
     """
     resolution = opacity.shape[0]
     if opacity.shape != (resolution,) * 3 or colors.shape != (resolution,) * 3 + (3,):
-        raise ValueError(
+        raise InvalidArgument(
             f"render_cube: opacity must be (R, R, R) and colors (R, R, R, 3), got {opacity.shape} and {colors.shape}"
         )
     view = _view(resolution, width * smooth)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.errors import InvalidArgument, InvalidFile
 from ...core.io import write_text
 from ...core.occupancy import DEFAULT_OPACITY_THRESHOLD, FREE_LABEL, IGNORE_LABEL, SURFACE_LABEL, opacity_from_signed
 from ...core.shards.finding import find_shards
@@ -146,12 +147,12 @@ def write_preview(
         OSError: the page cannot be written; one that was there stays.
     """
     if cubes < 0 or measured < 1:
-        raise ValueError(f"write_preview: cubes must be >= 0 and measured >= 1, got {cubes} and {measured}")
+        raise InvalidArgument(f"write_preview: cubes must be >= 0 and measured >= 1, got {cubes} and {measured}")
     root = Path(folder)
     shards = [(path.name, read_shard(path)) for path in find_shards(root)]
     total = sum(len(shard) for _, shard in shards)
     if total == 0:
-        raise ValueError(f"write_preview: the shards in {root} hold no cube")
+        raise InvalidFile(f"write_preview: the shards in {root} hold no cube")
     statistics = shard_statistics([shard for _, shard in shards], most=measured, seed=seed)
     facts: dict[str, Any] = {**statistics.summary(), "shards": len(shards), "total": total}
     if against is not None:

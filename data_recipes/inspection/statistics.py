@@ -40,6 +40,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ...core.errors import InvalidArgument
 from ...core.frames import RESOLUTION
 from ...core.occupancy import DEFAULT_OPACITY_THRESHOLD, FREE_LABEL, IGNORE_LABEL, SURFACE_LABEL, opacity_from_signed
 from ...core.shards.packing import dequantize_signed, quantize_signed, unpack_labels
@@ -181,12 +182,14 @@ def cube_statistics(inputs: NDArray[Any], labels: NDArray[np.uint8] | None = Non
         ValueError: another shape, or values that are not in [-1, 1].
     """
     if inputs.ndim != 4 or inputs.shape[1:] != (RESOLUTION,) * 3:
-        raise ValueError(f"cube_statistics: inputs must have shape (N, 32, 32, 32), got {inputs.shape}")
+        raise InvalidArgument(f"cube_statistics: inputs must have shape (N, 32, 32, 32), got {inputs.shape}")
     if labels is not None and labels.shape != inputs.shape:
-        raise ValueError(f"cube_statistics: labels must have the shape of inputs, {inputs.shape}, got {labels.shape}")
+        raise InvalidArgument(
+            f"cube_statistics: labels must have the shape of inputs, {inputs.shape}, got {labels.shape}"
+        )
     if inputs.dtype != np.uint8:
         if inputs.size and not (np.abs(inputs) <= 1.0).all():
-            raise ValueError("cube_statistics: inputs must lie in [-1, 1] (signed opacity), others were found")
+            raise InvalidArgument("cube_statistics: inputs must lie in [-1, 1] (signed opacity), others were found")
         inputs = quantize_signed(inputs)
     names = [*FEATURES, *(AGREEMENT if labels is not None else ())]
     table, levels = np.zeros((len(inputs), len(names))), np.zeros((len(inputs), LEVELS), dtype=np.int32)
@@ -209,7 +212,7 @@ def shard_statistics(shards: Sequence[Shard | str | Path], *, most: int | None =
         ValueError: no shard, or ``most`` < 1.
     """
     if not shards or (most is not None and most < 1):
-        raise ValueError(f"shard_statistics: needs at least one shard and most >= 1, got {len(shards)} and {most}")
+        raise InvalidArgument(f"shard_statistics: needs at least one shard and most >= 1, got {len(shards)} and {most}")
     opened = [shard if isinstance(shard, Shard) else read_shard(shard) for shard in shards]
     places = [(number, row) for number, shard in enumerate(opened) for row in range(len(shard))]
     if most is not None and most < len(places):
@@ -240,7 +243,7 @@ def wasserstein(
     for values, weights in ((first, first_weights), (second, second_weights)):
         count = np.size(values)
         if not (count if weights is None else np.sum(weights)) > 0:
-            raise ValueError(f"wasserstein: each sample must have some weight, got {count} values without")
+            raise InvalidArgument(f"wasserstein: each sample must have some weight, got {count} values without")
     return float(wasserstein_distance(first, second, first_weights, second_weights))
 
 
@@ -263,7 +266,7 @@ def feature_distances(first: CubeStatistics, second: CubeStatistics) -> dict[str
         ValueError: a set without cubes.
     """
     if not len(first) or not len(second):
-        raise ValueError(f"feature_distances: both sets need cubes, got {len(first)} and {len(second)}")
+        raise InvalidArgument(f"feature_distances: both sets need cubes, got {len(first)} and {len(second)}")
     found = {
         name: wasserstein(mapped(first.features[name]), mapped(second.features[name]))
         for name, mapped in FEATURES.items()
@@ -286,7 +289,7 @@ def sampling_floor(found: CubeStatistics, *, rounds: int = 16, seed: int = 0) ->
         ValueError: fewer than two cubes.
     """
     if len(found) < 2:
-        raise ValueError(f"sampling_floor: needs at least two cubes, got {len(found)}")
+        raise InvalidArgument(f"sampling_floor: needs at least two cubes, got {len(found)}")
     rng, half, distances = np.random.default_rng(seed), len(found) // 2, []
     for _ in range(rounds):
         order = rng.permutation(len(found))

@@ -12,6 +12,7 @@ from importlib.util import find_spec
 from xml.etree import ElementTree
 from xml.parsers import expat
 
+from ...core.errors import MissingExtra
 from .reading import Array, MeshRejected, no_triangles, trimesh_triangles
 
 _REMOVED = frozenset(
@@ -93,7 +94,7 @@ def read_dae(data: bytes) -> Array:
     if expected == 0:
         return no_triangles()
     if find_spec("collada") is None:
-        raise ImportError("reading .dae needs pycollada: pip install unghost[recipes]")
+        raise MissingExtra("reading .dae needs pycollada: pip install unghost[recipes]")
     triangles = trimesh_triangles(ElementTree.tostring(root), "dae")
     if len(triangles) != expected:
         raise MeshRejected(f"{expected} triangles are in the scene, {len(triangles)} were read")

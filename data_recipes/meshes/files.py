@@ -24,6 +24,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
+from ...core.errors import MissingExtra, MissingFile
 from .collada import check_xml, read_dae
 from .gltf import read_glb, read_gltf
 from .ply import read_ply
@@ -102,7 +103,7 @@ def read_mesh_file(path: str | Path, *, root: str | Path | None = None) -> MeshF
     _require_trimesh("read_mesh_file")
     source = Path(path)
     if not source.exists():
-        raise FileNotFoundError(f"read_mesh_file: {source} is not a file")
+        raise MissingFile(f"read_mesh_file: {source} is not a file")
     if root is None:  # a link that the caller names is the caller's own
         source = source.resolve()
         folder = source.parent
@@ -136,7 +137,7 @@ def load_mesh(path: str | Path) -> Mesh:
 
     source = Path(path)
     if not source.is_file():
-        raise FileNotFoundError(f"load_mesh: {source} is not a file")
+        raise MissingFile(f"load_mesh: {source} is not a file")
     _require_trimesh("load_mesh")
     try:
         return Mesh.from_triangles(read_mesh_file(source).triangles)
@@ -265,4 +266,4 @@ def _require_trimesh(caller: str) -> None:
     try:
         import trimesh  # noqa: F401
     except ImportError as error:
-        raise ImportError(f"{caller}: reading meshes needs trimesh: pip install unghost[recipes]") from error
+        raise MissingExtra(f"{caller}: reading meshes needs trimesh: pip install unghost[recipes]") from error

@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from ...core.errors import InvalidFile
 from .reading import Array, MeshRejected, no_triangles, trimesh_triangles
 
 Side = Callable[[str], bytes]
@@ -93,7 +94,7 @@ def _read(text: bytes, binary: bytes | None, side: Side) -> Array:
 
 
 def _no_constant(name: str) -> float:
-    raise ValueError(f"{name} is no JSON number")
+    raise InvalidFile(f"{name} is no JSON number")
 
 
 def _number_of(value: Any, limit: int, what: str) -> int:

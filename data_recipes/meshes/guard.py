@@ -34,6 +34,7 @@ from typing import Any
 
 import numpy as np
 
+from ...core.errors import InvalidArgument, MissingExtra
 from .files import MOST_TRIANGLES, MeshFile, mesh_suffixes
 from .reading import Array
 from .repair import RepairOptions
@@ -69,7 +70,7 @@ class GuardLimits:
         for name, least in (("cpu_seconds", 0), ("wall_seconds", 0), ("startup_seconds", 0), ("memory_megabytes", 63)):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > least):
-                raise ValueError(f"GuardLimits: {name} must be finite and > {least}, got {value}")
+                raise InvalidArgument(f"GuardLimits: {name} must be finite and > {least}, got {value}")
 
 
 @dataclass(frozen=True)
@@ -200,7 +201,7 @@ class MeshGuard:
             raise RuntimeError(f"MeshGuard: the reader process did not start ({death})") from None
         if "missing" in ready:
             self.close()
-            raise ImportError("MeshGuard: reading meshes needs trimesh: pip install unghost[recipes]")
+            raise MissingExtra("MeshGuard: reading meshes needs trimesh: pip install unghost[recipes]")
         self.memory_capped = bool(ready["capped"])
 
     def _send(self, path: Path) -> None:

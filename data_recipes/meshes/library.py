@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.errors import InvalidArgument, InvalidFile, MissingFile
 from ..recipe import Recipe
 from .box_tree import BoxTree
 
@@ -45,19 +46,21 @@ class Mesh:
         """
         soup = np.asarray(triangles, dtype=np.float64)
         if soup.ndim != 3 or soup.shape[1:] != (3, 3):
-            raise ValueError(f"Mesh: triangles must have shape (F, 3, 3), got {soup.shape}")
+            raise InvalidArgument(f"Mesh: triangles must have shape (F, 3, 3), got {soup.shape}")
         if not np.isfinite(soup).all():
-            raise ValueError(f"Mesh: corners must be finite, got {int((~np.isfinite(soup)).sum())} that are not")
+            raise InvalidArgument(f"Mesh: corners must be finite, got {int((~np.isfinite(soup)).sum())} that are not")
         low, high = (soup.min(axis=(0, 1)), soup.max(axis=(0, 1))) if len(soup) else (np.zeros(3), np.zeros(3))
         extent = float((high - low).max())
         if not (np.isfinite(extent) and extent > 0):
-            raise ValueError(f"Mesh: the longest side must be finite and > 0, got {extent} from {len(soup)} triangles")
+            raise InvalidArgument(
+                f"Mesh: the longest side must be finite and > 0, got {extent} from {len(soup)} triangles"
+            )
         soup = (soup - (low + high) / 2) / extent
         normals = np.cross(soup[:, 1] - soup[:, 0], soup[:, 2] - soup[:, 0])
         areas = np.linalg.norm(normals, axis=1) / 2
         kept = areas > 1e-14
         if not kept.any():
-            raise ValueError(f"Mesh: at least one triangle must have an area, got {len(soup)} without")
+            raise InvalidArgument(f"Mesh: at least one triangle must have an area, got {len(soup)} without")
         soup, areas, normals = soup[kept], areas[kept], normals[kept]
         normals /= 2 * areas[:, None]
         return cls(soup, normals, np.cumsum(areas) / areas.sum(), BoxTree.build(soup))
@@ -88,13 +91,13 @@ def read_manifest(content: bytes, *, where: str) -> list[dict[str, str]]:
         reader = csv.DictReader(io.StringIO(content.decode("utf-8"), newline=""))
         missing = [name for name in _MANIFEST_COLUMNS if name not in (reader.fieldnames or ())]
         if missing:
-            raise ValueError(f"select_meshes: {where} lacks the columns {', '.join(missing)}")
+            raise InvalidFile(f"select_meshes: {where} lacks the columns {', '.join(missing)}")
         rows = list(reader)
     except (csv.Error, UnicodeDecodeError) as error:
-        raise ValueError(f"select_meshes: {where} is not CSV in UTF-8 ({error})") from None
+        raise InvalidFile(f"select_meshes: {where} is not CSV in UTF-8 ({error})") from None
     for number, row in enumerate(rows):
         if None in row or None in [row[name] for name in _MANIFEST_COLUMNS]:
-            raise ValueError(f"select_meshes: row {number} of {where} has more or fewer columns than its head")
+            raise InvalidFile(f"select_meshes: row {number} of {where} has more or fewer columns than its head")
     return rows
 
 
@@ -107,7 +110,7 @@ def select_meshes(recipe: Recipe, mesh_root: str | Path) -> list[MeshEntry]:
     """
     manifest = Path(mesh_root) / MANIFEST
     if not manifest.is_file():
-        raise FileNotFoundError(
+        raise MissingFile(
             f"select_meshes: {manifest} is not a file: a folder of meshes needs one that lists them, with the columns "
             f"{', '.join(_MANIFEST_COLUMNS)}"
         )
@@ -122,9 +125,9 @@ def select_meshes(recipe: Recipe, mesh_root: str | Path) -> list[MeshEntry]:
     for entry in entries:
         named = Path(rows[entry.row]["path"])
         if named.is_absolute() or ".." in named.parts:
-            raise ValueError(f"select_meshes: row {entry.row} of {manifest} leaves the folder: {named}")
+            raise InvalidFile(f"select_meshes: row {entry.row} of {manifest} leaves the folder: {named}")
     if not entries:
-        raise ValueError(
+        raise InvalidArgument(
             f"select_meshes: no mesh of {manifest} has split {recipe.split!r}, a licence of {list(recipe.licences)} "
             f"and a format of {list(recipe.formats)}"
         )

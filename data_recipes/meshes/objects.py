@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.distances.sampled import SampledDistance
+from ...core.errors import InvalidArgument
 from ..recipe import load_recipe
 from .sources import open_library
 
@@ -37,11 +38,11 @@ def solid_from_triangles(triangles: NDArray[Any], *, cells: int = CELLS) -> Samp
 
     soup = np.asarray(triangles, dtype=np.float32)
     if cells < 4:
-        raise ValueError(f"solid_from_triangles: cells must be >= 4, got {cells}")
+        raise InvalidArgument(f"solid_from_triangles: cells must be >= 4, got {cells}")
     low, high = soup.min(axis=(0, 1)).astype(np.float64), soup.max(axis=(0, 1)).astype(np.float64)
     pitch = float((high - low).max()) / cells
     if not 0 < pitch < np.inf:
-        raise ValueError(f"solid_from_triangles: triangles must have an extent, got {pitch * cells}")
+        raise InvalidArgument(f"solid_from_triangles: triangles must have an extent, got {pitch * cells}")
     start = low - MARGIN * pitch
     counts = np.ceil((high - low) / pitch).astype(int) + 2 * MARGIN + 1
     nodes = np.stack(np.meshgrid(*(start[a] + pitch * np.arange(counts[a]) for a in range(3)), indexing="ij"), axis=-1)

@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.errors import InvalidFile, MissingExtra
+
 Array = NDArray[Any]
 
 _MARKS = ((b"\xef\xbb\xbf", "utf-8-sig"), (b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16"))
@@ -19,11 +21,11 @@ MOST_CORNERS = 20_000  # of a concave polygon: cut in less than a second, or in 
 _FLATTEST = 1e-9  # smallest singular value over the largest of a node's transform
 
 
-class MeshRejected(ValueError):
+class MeshRejected(InvalidFile):
     """The file is refused; the message is the reason, without the file's name."""
 
 
-class MeshEmpty(ValueError):
+class MeshEmpty(InvalidFile):
     """A sound file without a triangle; the message says what it holds instead."""
 
 
@@ -123,7 +125,7 @@ def _cut_concave(rings: Array) -> tuple[Array, Array]:
     try:
         from mapbox_earcut import triangulate_float64
     except ImportError as error:
-        raise ImportError("triangulate: concave polygons need mapbox_earcut: pip install unghost[recipes]") from error
+        raise MissingExtra("triangulate: concave polygons need mapbox_earcut: pip install unghost[recipes]") from error
     moved = rings - rings[:, :1]
     moved = np.ldexp(moved, -np.frexp(np.abs(moved).max(axis=(1, 2), keepdims=True))[1])  # at most 1, without rounding
     normal = np.cross(moved, np.roll(moved, -1, axis=1)).sum(axis=1)

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.errors import InvalidArgument, MissingExtra
 from ...core.frames import CubeFrame
 
 Array = NDArray[Any]
@@ -102,7 +103,7 @@ class RepairOptions:
         }
         for name, fits in ranges.items():
             if not fits:
-                raise ValueError(f"RepairOptions: {name} is outside its range, got {getattr(self, name)}")
+                raise InvalidArgument(f"RepairOptions: {name} is outside its range, got {getattr(self, name)}")
 
 
 @dataclass(frozen=True)
@@ -132,13 +133,13 @@ def repair_triangles(triangles: Array, *, options: RepairOptions | None = None) 
     try:
         import pymeshlab
     except ImportError as error:
-        raise ImportError(f"repair_triangles: repairing needs pymeshlab: {_EXTRA}") from error
+        raise MissingExtra(f"repair_triangles: repairing needs pymeshlab: {_EXTRA}") from error
     options = options or RepairOptions()
     soup = _checked(triangles, "repair_triangles")
     vertices, faces = _weld(soup)
     extent = float(np.ptp(vertices, axis=0).max()) if len(vertices) else 0.0
     if not (math.isfinite(extent) and extent > 0):
-        raise ValueError(f"repair_triangles: the longest side must be finite and > 0, got {extent}")
+        raise InvalidArgument(f"repair_triangles: the longest side must be finite and > 0, got {extent}")
     middle = vertices.mean(axis=0)
     meshes = pymeshlab.MeshSet(verbose=False)
     meshes.add_mesh(pymeshlab.Mesh((vertices - middle) / extent, faces.astype(np.int32)))
@@ -152,7 +153,7 @@ def repair_triangles(triangles: Array, *, options: RepairOptions | None = None) 
     mesh = meshes.current_mesh()
     repaired = np.asarray(mesh.vertex_matrix(), dtype=np.float64)[mesh.face_matrix()] * extent + middle
     if len(repaired) == 0 or not np.isfinite(repaired).all():
-        raise ValueError(f"repair_triangles: nothing sound is left of {len(soup)} triangles")
+        raise InvalidArgument(f"repair_triangles: nothing sound is left of {len(soup)} triangles")
     return Repaired(repaired, topology(soup), topology(repaired))
 
 
@@ -200,7 +201,7 @@ def winding_numbers(points: Array, triangles: Array) -> Array:
     soup = _checked(triangles, "winding_numbers")
     points = np.asarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
-        raise ValueError(f"winding_numbers: points must be finite of shape (N, 3), got {points.shape}")
+        raise InvalidArgument(f"winding_numbers: points must be finite of shape (N, 3), got {points.shape}")
     result = np.zeros(len(points))
     for i in range(len(points)):
         for start in range(0, len(soup), _BLOCK):
@@ -235,13 +236,15 @@ def fill_solid(triangles: Array, frame: CubeFrame, surface: Occupancy, *, rule: 
         ValueError: an unknown rule, a bad shape, or a surface that is not closed: there is no inside then.
     """
     if rule not in RULES:
-        raise ValueError(f"fill_solid: rule must be one of {', '.join(RULES)}, got {rule!r}")
+        raise InvalidArgument(f"fill_solid: rule must be one of {', '.join(RULES)}, got {rule!r}")
     if surface.ndim != 3 or len(set(surface.shape)) != 1 or surface.dtype != bool:
-        raise ValueError(f"fill_solid: surface must be bool of shape (R, R, R), got {surface.dtype} {surface.shape}")
+        raise InvalidArgument(
+            f"fill_solid: surface must be bool of shape (R, R, R), got {surface.dtype} {surface.shape}"
+        )
     soup = _checked(triangles, "fill_solid")
     whole = topology(soup)
     if not whole.closed:
-        raise ValueError(
+        raise InvalidArgument(
             f"fill_solid: the surface must be closed, got {whole.unbalanced_edges} edges that are not balanced "
             f"({whole.boundary_edges} of one triangle, {whole.turned_edges} between triangles that face opposite ways)"
         )
@@ -256,7 +259,7 @@ def _by_regions(soup: Array, centers: Array, surface: Occupancy) -> Occupancy:
     try:
         from scipy import ndimage
     except ImportError as error:
-        raise ImportError(f"fill_solid: filling needs scipy: {_EXTRA}") from error
+        raise MissingExtra(f"fill_solid: filling needs scipy: {_EXTRA}") from error
     regions, count = ndimage.label(~surface)
     if count == 0:
         return np.zeros_like(surface)
@@ -272,7 +275,7 @@ def _by_distance(soup: Array, centers: Array, surface: Occupancy) -> Occupancy:
     try:
         import open3d
     except ImportError as error:
-        raise ImportError(f"fill_solid: rule='signed_distance' needs open3d: {_EXTRA}") from error
+        raise MissingExtra(f"fill_solid: rule='signed_distance' needs open3d: {_EXTRA}") from error
     vertices, faces = _weld(soup)
     scene = open3d.t.geometry.RaycastingScene()
     tensor: Any = open3d.core.Tensor
@@ -292,7 +295,7 @@ def _weld(soup: Array) -> tuple[Array, Array]:
 def _checked(triangles: Array, caller: str) -> Array:
     soup = np.asarray(triangles, dtype=np.float64)
     if soup.ndim != 3 or soup.shape[1:] != (3, 3):
-        raise ValueError(f"{caller}: triangles must have shape (F, 3, 3), got {soup.shape}")
+        raise InvalidArgument(f"{caller}: triangles must have shape (F, 3, 3), got {soup.shape}")
     if not np.isfinite(soup).all():
-        raise ValueError(f"{caller}: triangles must be finite, got {int((~np.isfinite(soup)).sum())} other values")
+        raise InvalidArgument(f"{caller}: triangles must be finite, got {int((~np.isfinite(soup)).sum())} other values")
     return soup

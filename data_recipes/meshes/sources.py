@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.errors import InvalidFile
 from ...core.frames import CubeFrame
 from ...core.shards.storage import stays_within
 from ..recipe import Recipe
@@ -88,12 +89,12 @@ class MeshLibrary:
         path, row = self._relative(entry), self._rows[entry.row]
         try:
             if not stays_within(path):
-                raise ValueError("rejected: its path holds a character that is no part of a name on every system")
+                raise InvalidFile("rejected: its path holds a character that is no part of a name on every system")
             outcome = self._guard.read(path)
             if outcome.mesh is None:
-                raise ValueError(f"{outcome.status}: {outcome.reason}")
+                raise InvalidFile(f"{outcome.status}: {outcome.reason}")
             if row.get("sha256") not in (None, "", outcome.mesh.sha256):
-                raise ValueError(f"rejected: its sha256 is {outcome.mesh.sha256}, {MANIFEST} says {row['sha256']}")
+                raise InvalidFile(f"rejected: its sha256 is {outcome.mesh.sha256}, {MANIFEST} says {row['sha256']}")
             mesh = Mesh.from_triangles(outcome.mesh.triangles)
         except ValueError as error:
             reason = " ".join(str(error).replace(str(self.root.resolve()), "").replace(str(self.root), "").split())
@@ -116,7 +117,7 @@ class MeshLibrary:
                 return entry, passed
             passed.append(entry.row)
         first = self.rejected[passed[0]]
-        raise ValueError(f"curate: none of the {len(passed)} meshes is usable; of {first['path']}: {first['reason']}")
+        raise InvalidFile(f"curate: none of the {len(passed)} meshes is usable; of {first['path']}: {first['reason']}")
 
     def mesh(self, place: int, *, seed: int = 0) -> tuple[MeshEntry, Mesh]:
         """The mesh at ``place >= 0`` of the shuffled order, or the next one after it that is usable.

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.errors import InvalidArgument
 from ...core.frames import RESOLUTION
 
 Array = NDArray[Any]
@@ -33,11 +34,13 @@ _BLOCK = 1 << 16  # columns expanded at once: bounds memory and stays within a c
 def _check(triangles: Array, resolution: int, caller: str) -> Array:
     triangles = np.asarray(triangles, dtype=np.float64)
     if triangles.ndim != 3 or triangles.shape[1:] != (3, 3):
-        raise ValueError(f"{caller}: triangles must have shape (F, 3, 3), got {triangles.shape}")
+        raise InvalidArgument(f"{caller}: triangles must have shape (F, 3, 3), got {triangles.shape}")
     if resolution < 1:
-        raise ValueError(f"{caller}: resolution must be >= 1, got {resolution}")
+        raise InvalidArgument(f"{caller}: resolution must be >= 1, got {resolution}")
     if not np.isfinite(triangles).all():
-        raise ValueError(f"{caller}: triangles must be finite, got {int((~np.isfinite(triangles)).sum())} other values")
+        raise InvalidArgument(
+            f"{caller}: triangles must be finite, got {int((~np.isfinite(triangles)).sum())} other values"
+        )
     return triangles
 
 
@@ -78,13 +81,13 @@ def voxelize_batch(triangles: Array, cubes: Array, count: int, *, resolution: in
     triangles = _check(triangles, resolution, "voxelize_batch")
     cubes = np.asarray(cubes)
     if cubes.shape != triangles.shape[:1] or not np.issubdtype(cubes.dtype, np.integer):
-        raise ValueError(
+        raise InvalidArgument(
             f"voxelize_batch: cubes must be whole numbers of shape ({len(triangles)},), got {cubes.dtype} {cubes.shape}"
         )
     if count < 0:
-        raise ValueError(f"voxelize_batch: count must be >= 0, got {count}")
+        raise InvalidArgument(f"voxelize_batch: count must be >= 0, got {count}")
     if len(cubes) and not 0 <= cubes.min() <= cubes.max() < count:
-        raise ValueError(f"voxelize_batch: cubes must lie in [0, {count}), got {cubes.min()} to {cubes.max()}")
+        raise InvalidArgument(f"voxelize_batch: cubes must lie in [0, {count}), got {cubes.min()} to {cubes.max()}")
     return _voxelize(triangles, cubes.astype(np.intp), count, resolution)
 
 

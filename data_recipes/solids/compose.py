@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.distances import signed as sd
+from ...core.errors import InvalidArgument
 from ...core.frames import RESOLUTION, CubeFrame, random_rotations
 from ..recipe import Recipe
 from .narrow_band import shell_in_cube
@@ -230,7 +231,7 @@ def dilate(occupancy: Occupancy, iterations: int, *, faces_only: bool = False) -
         [27, 7]
     """
     if iterations < 0:
-        raise ValueError(f"dilate: iterations must be >= 0, got {iterations}")
+        raise InvalidArgument(f"dilate: iterations must be >= 0, got {iterations}")
     grown = occupancy.copy()
     for _ in range(iterations):
         source = grown.copy() if faces_only else grown

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.errors import InvalidArgument, MissingExtra
 from ...core.frames import CubeFrame, random_rotations
 from ..meshes.crops import choose_frame, cut_cubes
 from ..meshes.library import Mesh
@@ -54,19 +55,19 @@ class CsgSettings:
         for name, least in (("leaves", 1), ("extent", 1e-3), ("segments", 3)):
             low, high = getattr(self, name)
             if not least <= low <= high < np.inf:
-                raise ValueError(
+                raise InvalidArgument(
                     f"CsgSettings: {name} must be (low, high) with {least} <= low <= high, got {low, high}"
                 )
         shares = (self.cut_share, self.common_share, self.hull_share)
         if min(shares) < 0 or sum(shares) > 1:
-            raise ValueError(f"CsgSettings: shares must be >= 0 and add to at most 1, got {shares}")
+            raise InvalidArgument(f"CsgSettings: shares must be >= 0 and add to at most 1, got {shares}")
 
 
 def _manifold3d() -> Any:
     try:
         import manifold3d
     except ImportError as error:
-        raise ImportError("csg: boolean solids need manifold3d: pip install unghost[recipes]") from error
+        raise MissingExtra("csg: boolean solids need manifold3d: pip install unghost[recipes]") from error
     return manifold3d
 
 

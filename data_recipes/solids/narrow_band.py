@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.errors import InvalidArgument
 from ...core.frames import RESOLUTION, unit_lattice
 from .primitives import Solid
 
@@ -56,7 +57,7 @@ def shell_in_cube(distance: Solid, *, thickness: float = 1.0, solid: bool = Fals
         ValueError: a thickness out of range.
     """
     if not 0 < thickness < np.inf:
-        raise ValueError(f"shell_in_cube: thickness must be finite and > 0, got {thickness}")
+        raise InvalidArgument(f"shell_in_cube: thickness must be finite and > 0, got {thickness}")
     widest = 1.5 * thickness * _SLACK / RESOLUTION  # three slopes of 1, half of it on each side
     coarse = distance(_MIDDLES.T)
     reach = widest + _SLACK * (_SIDE - 1) / 2 * np.sqrt(3.0) / RESOLUTION

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.cameras import Cameras
+from ...core.errors import MissingExtra
 from .difficulty import Difficulty, difficulty, every_nth, normalising_factor
 
 TRAIN_COLOUR, EVAL_COLOUR, LINK_COLOUR = "#1a1a1a", "#d62728", "#c9c9c9"
@@ -66,7 +67,7 @@ def draw_birds_eye(
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise ImportError("draw_birds_eye needs matplotlib: pip install unghost[eval]") from error
+        raise MissingExtra("draw_birds_eye needs matplotlib: pip install unghost[eval]") from error
     unit, plane = normalising_factor(train, evaluation), ground_plane(train, evaluation)
     center = np.concatenate([train.origins, evaluation.origins]).mean(axis=0)
     panels = [(heading, train, evaluation)]

@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from ...core.errors import InvalidFile, MissingExtra
+
 LENSES = {  # COLMAP's camera models -> their parameters in order, by the names of transforms.json
     "SIMPLE_PINHOLE": ("fl_x", "cx", "cy"),
     "PINHOLE": ("fl_x", "fl_y", "cx", "cy"),
@@ -32,7 +34,7 @@ def quiet_pycolmap(caller: str) -> Iterator[Any]:
     try:
         import pycolmap
     except ImportError as error:
-        raise ImportError(f"{caller}: COLMAP needs pycolmap: pip install unghost[capture]") from error
+        raise MissingExtra(f"{caller}: COLMAP needs pycolmap: pip install unghost[capture]") from error
     before = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     try:
@@ -89,7 +91,7 @@ def read_model(folder: str | Path, *, prefix: str = "") -> dict[str, Any]:
     source = Path(folder)
     ending = _ending(source)
     if ending is None:
-        raise ValueError(f"read_model: {source} has no cameras and images, .bin or .txt: not a COLMAP model")
+        raise InvalidFile(f"read_model: {source} has no cameras and images, .bin or .txt: not a COLMAP model")
     with quiet_pycolmap("read_model") as pycolmap, tempfile.TemporaryDirectory() as scratch:
         for name in ("cameras", "images"):
             shutil.copyfile(source / f"{name}{ending}", Path(scratch, f"{name}{ending}"))
@@ -99,10 +101,10 @@ def read_model(folder: str | Path, *, prefix: str = "") -> dict[str, Any]:
             model = pycolmap.Reconstruction(scratch)
         except Exception as error:  # whatever the library makes of bad bytes
             reason = str(error).replace(scratch, str(source)).splitlines()[0]
-            raise ValueError(f"read_model: {source} is no COLMAP model that can be read ({reason})") from None
+            raise InvalidFile(f"read_model: {source} is no COLMAP model that can be read ({reason})") from None
     photos = sorted((each for each in model.images.values() if each.has_pose), key=lambda each: each.name)
     if not photos:
-        raise ValueError(f"read_model: {source} has no photo with a pose")
+        raise InvalidFile(f"read_model: {source} has no photo with a pose")
     lenses = {number: _lens(camera, source) for number, camera in model.cameras.items()}
     frames = []
     for photo in photos:
@@ -115,7 +117,7 @@ def _lens(camera: Any, source: Path) -> dict[str, Any]:
     """One camera's part of a frame."""
     model = camera.model.name
     if model not in LENSES:
-        raise ValueError(
+        raise InvalidFile(
             f"read_model: camera {camera.camera_id} of {source} is a {model}, none of {', '.join(LENSES)}; "
             "undistort the photos first (colmap image_undistorter)"
         )

@@ -8,6 +8,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from ...core.errors import InvalidArgument, MissingFile
 from ...core.io import new_folder, write_json
 from .frames import Extraction, extract_frames
 from .loading import load_capture
@@ -54,7 +55,7 @@ def make_capture(
     for sweep, source in sources.items():
         if not source.exists():
             purpose = "to train on" if sweep == "train" else "to be scored on"
-            raise FileNotFoundError(f"make_capture: no video or folder {source} {purpose}")
+            raise MissingFile(f"make_capture: no video or folder {source} {purpose}")
     with new_folder(Path(out)) as partial:
         images = partial / "images"
         taken = {
@@ -63,7 +64,7 @@ def make_capture(
         }
         sizes = {sweep: f"{found.size[0]} x {found.size[1]}" for sweep, found in taken.items()}
         if len(set(sizes.values())) > 1:
-            raise ValueError(
+            raise InvalidArgument(
                 f"make_capture: both sweeps must have pictures of one size, got train {sizes['train']}, eval "
                 f"{sizes['eval']}; record both alike, or resize one"
             )
@@ -79,7 +80,7 @@ def make_capture(
             if not kept:
                 raise
             said = " and ".join(f"those of {source} in {folder}" for source, folder in kept.items())
-            raise ValueError(
+            raise InvalidArgument(
                 f"{error}; the frames are kept, {said}: a folder can be given in a video's place"
             ) from None
         sweeps = {sweep: [f"images/{name}" for name in found] for sweep, found in posing.posed.items()}

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.cameras import Cameras
+from ...core.errors import InvalidArgument
 
 TIE = 1e-9  # in normalised units: nearer than that is the same place
 TWO_SWEEPS = "the other sweep"
@@ -57,7 +58,7 @@ def difficulty(train: Cameras, evaluation: Cameras, *, factor: float | None = No
     """
     for name, cameras in (("train", train), ("evaluation", evaluation)):
         if len(cameras) == 0:
-            raise ValueError(f"difficulty: {name} has no cameras: the measure is not defined")
+            raise InvalidArgument(f"difficulty: {name} has no cameras: the measure is not defined")
     unit = normalising_factor(train, evaluation) if factor is None else factor
     distance = np.linalg.norm(evaluation.origins[:, None] - train.origins[None], axis=-1) * unit
     turned = evaluation.camera_to_world[:, None, :, :3] - train.camera_to_world[None, :, :, :3]
@@ -81,7 +82,7 @@ def every_nth(count: int, *, n: int = 8) -> tuple[NDArray[np.int64], NDArray[np.
         positions that train, positions that are scored. The first is empty if there is but one photo.
     """
     if n < 2 or count < 0:
-        raise ValueError(f"every_nth: count must be >= 0 and n >= 2, got {count} and {n}")
+        raise InvalidArgument(f"every_nth: count must be >= 0 and n >= 2, got {count} and {n}")
     everything = np.arange(count)
     return everything[everything % n != 0], everything[everything % n == 0]
 

@@ -17,6 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.errors import InvalidArgument, InvalidFile, MissingExtra, MissingFile
+
 PHOTO_ENDINGS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 JPEG = {"quality": 95, "subsampling": 0}
 EXIF_ORIENTATION = 0x0112
@@ -45,7 +47,7 @@ def sharpness(grey: NDArray[Any]) -> float:
     Compares pictures of one scene and size only; noise counts as sharpness.
     """
     if grey.ndim != 2 or min(grey.shape) < 3:
-        raise ValueError(f"sharpness: grey must have shape (H, W), both > 2, got {grey.shape}")
+        raise InvalidArgument(f"sharpness: grey must have shape (H, W), both > 2, got {grey.shape}")
     picture = grey.astype(np.float32)
     inner = picture[1:-1, 1:-1]
     around = picture[:-2, 1:-1] + picture[2:, 1:-1] + picture[1:-1, :-2] + picture[1:-1, 2:]
@@ -71,16 +73,16 @@ def extract_frames(source: str | Path, folder: str | Path, *, prefix: str, count
     """
     origin, target = Path(source), Path(folder)
     if count < 1:
-        raise ValueError(f"extract_frames: count must be >= 1, got {count}")
+        raise InvalidArgument(f"extract_frames: count must be >= 1, got {count}")
     if not origin.exists():
-        raise FileNotFoundError(f"extract_frames: no video or folder {origin}")
+        raise MissingFile(f"extract_frames: no video or folder {origin}")
     target.mkdir(parents=True, exist_ok=True)
     take = _from_folder if origin.is_dir() else _from_video
     found = take(origin, target, prefix, count)
     sizes = Counter(size for _, _, size in found.pictures)
     if len(sizes) != 1:
         told = ", ".join(f"{n} of {width} x {height}" for (width, height), n in sizes.most_common())
-        raise ValueError(f"extract_frames: the pictures of {origin} must all have one size, got {told}")
+        raise InvalidArgument(f"extract_frames: the pictures of {origin} must all have one size, got {told}")
     paths, sources, (size, *_) = zip(*found.pictures)
     return Extraction(paths, sources, found.seen, size)
 
@@ -111,7 +113,7 @@ def _libraries(*names: str) -> list[Any]:
     try:
         return [importlib.import_module(name) for name in names]
     except ImportError as error:
-        raise ImportError(f"extract_frames: needs {error.name}: pip install unghost[capture]") from error
+        raise MissingExtra(f"extract_frames: needs {error.name}: pip install unghost[capture]") from error
 
 
 def _from_video(source: Path, folder: Path, prefix: str, count: int) -> _Found:
@@ -128,7 +130,7 @@ def _from_video(source: Path, folder: Path, prefix: str, count: int) -> _Found:
     try:
         with av.open(str(source)) as container:
             if not container.streams.video:
-                raise ValueError(f"extract_frames: {source} has no video in it")
+                raise InvalidFile(f"extract_frames: {source} has no video in it")
             total = sum(1 for packet in container.demux(video=0) if packet.size)
         with av.open(str(source)) as container:
             for number, frame in _sharpest(decoded(container), max(total, 1), count):
@@ -137,9 +139,9 @@ def _from_video(source: Path, folder: Path, prefix: str, count: int) -> _Found:
                 image.fromarray(np.ascontiguousarray(upright)).save(path, **JPEG)
                 pictures.append((path, number, (upright.shape[1], upright.shape[0])))
     except av.error.FFmpegError as error:
-        raise ValueError(f"extract_frames: cannot read {source} as a video ({error.strerror})") from None
+        raise InvalidFile(f"extract_frames: cannot read {source} as a video ({error.strerror})") from None
     if not pictures:
-        raise ValueError(f"extract_frames: {source} has no frame that can be decoded")
+        raise InvalidFile(f"extract_frames: {source} has no frame that can be decoded")
     return _Found(pictures, seen)
 
 
@@ -147,7 +149,7 @@ def _from_folder(source: Path, folder: Path, prefix: str, count: int) -> _Found:
     image, operations = _libraries("PIL.Image", "PIL.ImageOps")
     photos = sorted((path for path in source.iterdir() if path.suffix.lower() in PHOTO_ENDINGS), key=_natural)
     if not photos:
-        raise ValueError(f"extract_frames: no photos in {source} (looked for {', '.join(PHOTO_ENDINGS)})")
+        raise InvalidFile(f"extract_frames: no photos in {source} (looked for {', '.join(PHOTO_ENDINGS)})")
     pictures: list[tuple[Path, int | str, tuple[int, int]]] = []
     try:
         if len(photos) > count:
@@ -167,7 +169,7 @@ def _from_folder(source: Path, folder: Path, prefix: str, count: int) -> _Found:
                     upright.save(written, exif=upright.getexif(), **(JPEG if photo.format == "JPEG" else {}))
             pictures.append((written, path.name, size))
     except OSError as error:
-        raise ValueError(f"extract_frames: cannot read a photo of {source} ({error})") from None
+        raise InvalidFile(f"extract_frames: cannot read a photo of {source} ({error})") from None
     return _Found(pictures, len(photos))
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.cameras import Cameras
+from ...core.errors import InvalidArgument, InvalidFile, MissingExtra, MissingFile
 from .colmap import find_model, read_model
 from .splits import Splits, resolve_splits
 from .transforms import read_frames, read_lens, read_object
@@ -27,7 +28,7 @@ def _pillow() -> Any:
     try:
         from PIL import Image
     except ImportError as error:
-        raise ImportError("load_capture needs Pillow to read photos: pip install unghost[eval]") from error
+        raise MissingExtra("load_capture needs Pillow to read photos: pip install unghost[eval]") from error
     return Image
 
 
@@ -78,7 +79,7 @@ class Capture:
         if name == "all" and name not in self.splits:
             return np.arange(len(self))
         if name not in self.splits:
-            raise ValueError(f"Capture.split: no split {name!r}; choose from {', '.join([*self.splits, 'all'])}")
+            raise InvalidArgument(f"Capture.split: no split {name!r}; choose from {', '.join([*self.splits, 'all'])}")
         return self.splits[name].copy()
 
     def images(self, indices: Iterable[int] | slice | None = None) -> NDArray[np.float32]:
@@ -138,11 +139,11 @@ def load_capture(
     """
     source = Path(folder)
     if not source.is_dir():
-        raise FileNotFoundError(f"load_capture: no folder {source}")
+        raise MissingFile(f"load_capture: no folder {source}")
     if not downscale >= 1:
-        raise ValueError(f"load_capture: downscale must be >= 1, got {downscale}")
+        raise InvalidArgument(f"load_capture: downscale must be >= 1, got {downscale}")
     if missing not in MISSING:
-        raise ValueError(f"load_capture: missing must be one of {', '.join(MISSING)}, got {missing!r}")
+        raise InvalidArgument(f"load_capture: missing must be one of {', '.join(MISSING)}, got {missing!r}")
     meta, label, root = _source(source)
     frames, names, poses = read_frames(meta, f"{label} in {source}")
     found = [_photo_path(Path(photos or root), name) for name in names]
@@ -152,7 +153,7 @@ def load_capture(
     paths = tuple(path for path in found if path is not None)
     sizes = {_check_photo(path, frame, name, label) for path, frame, name in zip(paths, frames, names)}
     if len(sizes) != 1:
-        raise ValueError(f"load_capture: photos must all have one size, got {sorted(sizes)}")
+        raise InvalidFile(f"load_capture: photos must all have one size, got {sorted(sizes)}")
     width, height = sizes.pop()
     lens, bend = (np.stack(values) for values in zip(*(read_lens(*each, width, height) for each in zip(frames, names))))
     sweeps = resolve_splits(names, meta=meta, folder=root, given=splits, dropped=dropped)
@@ -174,13 +175,13 @@ def load_cameras(path: str | Path) -> Cameras:
     """
     file = Path(path) / "transforms.json" if Path(path).is_dir() else Path(path)
     if not file.is_file() and not (Path(path).is_dir() and find_model(Path(path))):
-        raise FileNotFoundError(f"load_cameras: no file {file}")
+        raise MissingFile(f"load_cameras: no file {file}")
     meta = read_object(file) if file.is_file() else _source(Path(path))[0]
     merged, names, poses = read_frames(meta, str(file))
     sizes = {f"{body.get('w')} x {body.get('h')}" for body in merged}
     stated: list[Any] = [merged[0].get("w"), merged[0].get("h")]
     if len(sizes) > 1 or not all(isinstance(side, (int, float)) and 1 <= side < np.inf for side in stated):
-        raise ValueError(f"load_cameras: {file} must state one w and h in pixels for all frames, got {sorted(sizes)}")
+        raise InvalidFile(f"load_cameras: {file} must state one w and h in pixels for all frames, got {sorted(sizes)}")
     width, height = (int(side) for side in stated)
     lens, bend = (np.stack(values) for values in zip(*(read_lens(*each, width, height) for each in zip(merged, names))))
     return Cameras.create(poses, lens, width, height, bend)
@@ -212,7 +213,7 @@ def _dropped(
     shown = ", ".join(absent[:5]) + (", …" if len(absent) > 5 else "")
     told = f"load_capture: {len(absent)} of the {len(names)} photos that {label} names are not in {folder}: {shown}"
     if missing == "error" or len(absent) == len(names):
-        raise FileNotFoundError(told if len(absent) == len(names) else f"{told} (missing='drop' leaves them out)")
+        raise MissingFile(told if len(absent) == len(names) else f"{told} (missing='drop' leaves them out)")
     warnings.warn(f"{told}; left out", stacklevel=3)
     return absent
 
@@ -223,10 +224,10 @@ def _check_photo(path: Path, frame: Mapping[str, Any], name: str, label: str) ->
         with image.open(path) as photo:
             found = (int(photo.width), int(photo.height))
     except OSError as error:
-        raise ValueError(f"load_capture: cannot read photo {path} ({error})") from None
+        raise InvalidFile(f"load_capture: cannot read photo {path} ({error})") from None
     stated = (int(frame.get("w", found[0])), int(frame.get("h", found[1])))
     if found != stated:
-        raise ValueError(
+        raise InvalidFile(
             f"load_capture: photo {name} is {found[0]} x {found[1]}, {label} says {stated[0]} x {stated[1]}"
         )
     return found
@@ -244,7 +245,7 @@ def _normalisation(
         wanted = [normalize] if isinstance(normalize, str) else list(normalize)
         unknown = [name for name in wanted if name not in sweeps]
         if unknown or not wanted:
-            raise ValueError(
+            raise InvalidArgument(
                 f"load_capture: normalize names no sweep: {unknown}; choose from {', '.join(sweeps) or 'none'}"
             )
         chosen = np.unique(np.concatenate([sweeps[name] for name in wanted]))
@@ -260,8 +261,8 @@ def _read_photo(path: Path, width: int, height: int) -> NDArray[np.float32]:
     try:
         with image.open(path) as photo:
             if photo.mode in ("RGBA", "LA", "PA") and photo.getchannel("A").getextrema()[0] < 255:
-                raise ValueError(f"Capture.images: {path} has transparent pixels; put it on a background first")
+                raise InvalidFile(f"Capture.images: {path} has transparent pixels; put it on a background first")
             small = photo.convert("RGB").resize((width, height), image.Resampling.BOX)
             return np.asarray(small, dtype=np.float32) / np.float32(255)
     except OSError as error:
-        raise ValueError(f"Capture.images: cannot decode {path} ({error})") from None
+        raise InvalidFile(f"Capture.images: cannot decode {path} ({error})") from None

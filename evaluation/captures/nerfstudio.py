@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.errors import InvalidArgument
 from ...core.io import new_folder, write_json
 from .loading import Capture
 from .transforms import write_transforms
@@ -53,14 +54,14 @@ def write_nerfstudio(
     """
     target, sweeps = Path(out), {"train": [int(k) for k in train], "eval": [int(k) for k in evaluation]}
     if photos not in PHOTOS:
-        raise ValueError(f"write_nerfstudio: photos must be one of {', '.join(PHOTOS)}, got {photos!r}")
+        raise InvalidArgument(f"write_nerfstudio: photos must be one of {', '.join(PHOTOS)}, got {photos!r}")
     if not all(sweeps.values()):
-        raise ValueError(
+        raise InvalidArgument(
             f"write_nerfstudio: both sweeps need photos, got {len(sweeps['train'])} and {len(sweeps['eval'])}"
         )
     size = (capture.cameras.width, capture.cameras.height)
     if (capture.transform != np.eye(4)).any() or capture.photo_size(0) != size:
-        raise ValueError("write_nerfstudio: capture must be read with downscale=1 and normalize=False")
+        raise InvalidArgument("write_nerfstudio: capture must be read with downscale=1 and normalize=False")
     with new_folder(target) as partial:
         chosen = sorted({*sweeps["train"], *sweeps["eval"]})
         names = dict(zip(chosen, _flat_names([capture.paths[k] for k in chosen], [capture.names[k] for k in chosen])))

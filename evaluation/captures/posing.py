@@ -9,6 +9,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
+from ...core.errors import InvalidArgument
 from .colmap import quiet_pycolmap
 
 Progress = Callable[[str, int, int], None]
@@ -38,11 +39,11 @@ class PosingSettings:
     def __post_init__(self) -> None:
         """Refuse what makes no sense."""
         if not 0 < self.minimum_share <= 1:
-            raise ValueError(f"PosingSettings: minimum_share must be in (0, 1], got {self.minimum_share}")
+            raise InvalidArgument(f"PosingSettings: minimum_share must be in (0, 1], got {self.minimum_share}")
         if self.longest_side < 64:
-            raise ValueError(f"PosingSettings: longest_side must be >= 64 pixels, got {self.longest_side}")
+            raise InvalidArgument(f"PosingSettings: longest_side must be >= 64 pixels, got {self.longest_side}")
         if self.seed < 0 or self.threads < 0:
-            raise ValueError(f"PosingSettings: seed and threads must be >= 0, got {self.seed} and {self.threads}")
+            raise InvalidArgument(f"PosingSettings: seed and threads must be >= 0, got {self.seed} and {self.threads}")
 
 
 @dataclass(frozen=True)
@@ -89,10 +90,10 @@ def pose_jointly(
     how = settings or PosingSettings()
     names = [name for photos in sweeps.values() for name in photos]
     if not names or len(set(names)) != len(names) or not all(sweeps.values()):
-        raise ValueError(f"pose_jointly: sweeps must have a photo each and share none, got {dict(sweeps)}")
+        raise InvalidArgument(f"pose_jointly: sweeps must have a photo each and share none, got {dict(sweeps)}")
     spaced = next((name for name in names if len(name.split()) != 1), None)
     if spaced is not None:
-        raise ValueError(f"pose_jointly: names of photos must have no spaces in them, got {spaced!r}")
+        raise InvalidArgument(f"pose_jointly: names of photos must have no spaces in them, got {spaced!r}")
     tell = progress or (lambda stage, done, total: None)
     with quiet_pycolmap("pose_jointly") as pycolmap, tempfile.TemporaryDirectory() as scratch:
         database = Path(scratch, "database.db")
@@ -107,7 +108,7 @@ def pose_jointly(
             if all(len(posed[sweep]) >= how.minimum_share * len(photos) for sweep, photos in sweeps.items())
         ]
         if not enough:
-            raise ValueError(_complaint(counts, sweeps, how.minimum_share))
+            raise InvalidArgument(_complaint(counts, sweeps, how.minimum_share))
         best = max(enough, key=lambda number: sum(map(len, counts[number].values())))
         model, posed = parts[best], counts[best]
         Path(out).mkdir(parents=True, exist_ok=True)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.errors import InvalidArgument
 from .transforms import clean_name, first_twice, read_object
 
 FILE_LISTS = {"train_filenames": "train", "val_filenames": "val", "test_filenames": "test"}
@@ -58,15 +59,15 @@ def resolve_splits(
         if isinstance(files, str):
             continue  # a note for people
         if isinstance(files, Mapping) or not isinstance(files, Sequence) or not files:
-            raise ValueError(f"load_capture: split {split!r} must be a list of file names with at least one")
+            raise InvalidArgument(f"load_capture: split {split!r} must be a list of file names with at least one")
         if not all(isinstance(file, str) for file in files):
-            raise ValueError(f"load_capture: split {split!r} must be a list of file names, got {list(files)[:3]}")
+            raise InvalidArgument(f"load_capture: split {split!r} must be a list of file names, got {list(files)[:3]}")
         found = [_the_one(file, position, dropped, split) for file in files]
         kept = [name for name in found if name in position]
         if len(set(found)) != len(found):
-            raise ValueError(f"load_capture: split {split!r} lists {first_twice(found)!r} twice")
+            raise InvalidArgument(f"load_capture: split {split!r} lists {first_twice(found)!r} twice")
         if not kept:
-            raise ValueError(f"load_capture: none of the {len(found)} photos of split {split!r} is there")
+            raise InvalidArgument(f"load_capture: none of the {len(found)} photos of split {split!r} is there")
         result[split] = np.array([position[name] for name in kept], dtype=np.int64)
     return result
 
@@ -79,7 +80,7 @@ def _the_one(file: str, position: Mapping[str, int], dropped: Sequence[str], spl
     ends = [each for each in (*position, *dropped) if each.endswith(f"/{name}")]
     if len(ends) != 1:
         number = "no frame" if not ends else f"{len(ends)} frames ({', '.join(ends[:3])})"
-        raise ValueError(f"load_capture: split {split!r} names {name!r}, which is in {number}")
+        raise InvalidArgument(f"load_capture: split {split!r} names {name!r}, which is in {number}")
     return ends[0]
 
 
@@ -137,4 +138,4 @@ def choose_split(
     if whole and not splits:
         return "all"
     known = ", ".join(splits) or "none: --splits can name them, or --train-split all --every 8"
-    raise ValueError(f"{option} must say which sweep is meant; the capture has {known}")
+    raise InvalidArgument(f"{option} must say which sweep is meant; the capture has {known}")

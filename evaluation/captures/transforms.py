@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.cameras import Cameras
+from ...core.errors import InvalidFile
 from ...core.io import read_json, write_json
 
 DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
@@ -33,9 +34,9 @@ def read_object(path: Path) -> dict[str, Any]:
     try:
         value = read_json(path, caller="load_capture")
     except FileNotFoundError:
-        raise ValueError(f"load_capture: {path.parent} has no {path.name}: not a capture") from None
+        raise InvalidFile(f"load_capture: {path.parent} has no {path.name}: not a capture") from None
     if not isinstance(value, dict):
-        raise ValueError(f"load_capture: {path} must hold an object, got a {type(value).__name__}")
+        raise InvalidFile(f"load_capture: {path} must hold an object, got a {type(value).__name__}")
     return value
 
 
@@ -65,10 +66,10 @@ def read_frames(meta: Mapping[str, Any], label: str) -> tuple[list[dict[str, Any
     """
     frames = meta.get("frames")
     if not isinstance(frames, list) or not frames:
-        raise ValueError(f"load_capture: {label} has no frames")
+        raise InvalidFile(f"load_capture: {label} has no frames")
     names = tuple(_frame_name(frame, number) for number, frame in enumerate(frames))
     if len(set(names)) != len(names):
-        raise ValueError(f"load_capture: {first_twice(names)!r} stands in two frames of {label}")
+        raise InvalidFile(f"load_capture: {first_twice(names)!r} stands in two frames of {label}")
     poses = np.stack([_pose(frame, name) for frame, name in zip(frames, names)])
     shared = {key: value for key, value in meta.items() if key != "frames"}
     return [{**shared, **frame} for frame in frames], names, poses
@@ -76,24 +77,24 @@ def read_frames(meta: Mapping[str, Any], label: str) -> tuple[list[dict[str, Any
 
 def _frame_name(frame: Any, number: int) -> str:
     if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
-        raise ValueError(f"load_capture: frame {number} of transforms.json has no file_path")
+        raise InvalidFile(f"load_capture: frame {number} of transforms.json has no file_path")
     return clean_name(frame["file_path"])
 
 
 def _pose(frame: Mapping[str, Any], name: str) -> NDArray[np.float64]:
     if "transform_matrix" not in frame:
-        raise ValueError(f"load_capture: the frame of {name} has no transform_matrix")
+        raise InvalidFile(f"load_capture: the frame of {name} has no transform_matrix")
     try:
         pose = np.array(frame["transform_matrix"], dtype=np.float64)
     except (TypeError, ValueError):
-        raise ValueError(f"load_capture: transform_matrix of {name} is not a matrix of numbers") from None
+        raise InvalidFile(f"load_capture: transform_matrix of {name} is not a matrix of numbers") from None
     if pose.shape not in ((4, 4), (3, 4)):
-        raise ValueError(f"load_capture: transform_matrix of {name} must have shape (4, 4), got {pose.shape}")
+        raise InvalidFile(f"load_capture: transform_matrix of {name} must have shape (4, 4), got {pose.shape}")
     if not np.isfinite(pose).all():
-        raise ValueError(f"load_capture: transform_matrix of {name} must be finite")
+        raise InvalidFile(f"load_capture: transform_matrix of {name} must be finite")
     rotation = pose[:3, :3]
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
-        raise ValueError(f"load_capture: transform_matrix of {name} must hold a rotation, got {rotation.tolist()}")
+        raise InvalidFile(f"load_capture: transform_matrix of {name} must hold a rotation, got {rotation.tolist()}")
     return pose[:3]
 
 
@@ -107,18 +108,18 @@ def read_lens(
     """
     model = frame.get("camera_model", "OPENCV")
     if model not in BENDS:
-        raise ValueError(f"load_capture: camera_model {model!r} of {name} is none of {', '.join(BENDS)}")
+        raise InvalidFile(f"load_capture: camera_model {model!r} of {name} is none of {', '.join(BENDS)}")
     focal = frame.get("fl_x")
     if focal is None and "camera_angle_x" in frame:
         focal = 0.5 * width / np.tan(0.5 * float(frame["camera_angle_x"]))
     if focal is None:
-        raise ValueError(f"load_capture: neither fl_x nor camera_angle_x is given for {name}")
+        raise InvalidFile(f"load_capture: neither fl_x nor camera_angle_x is given for {name}")
     lens = np.array([focal, frame.get("fl_y", focal), frame.get("cx", width / 2), frame.get("cy", height / 2)], "f8")
     bend = np.array([frame.get(key, 0.0) for key in DISTORTION_KEYS], dtype=np.float64)
     if not (np.isfinite(lens).all() and np.isfinite(bend).all() and (lens[:2] > 0).all()):
-        raise ValueError(f"load_capture: intrinsics of {name} must be finite with fl_x, fl_y > 0, got {lens.tolist()}")
+        raise InvalidFile(f"load_capture: intrinsics of {name} must be finite with fl_x, fl_y > 0, got {lens.tolist()}")
     if any(value and key not in BENDS[model] for key, value in zip(DISTORTION_KEYS, bend)):
-        raise ValueError(f"load_capture: {name} has distortion {bend.tolist()} but camera_model {model}")
+        raise InvalidFile(f"load_capture: {name} has distortion {bend.tolist()} but camera_model {model}")
     return lens, bend
 
 

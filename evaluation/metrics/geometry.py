@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.cameras import Cameras
+from ...core.errors import InvalidArgument
 from .checks import FloatArray, Mask, check_pair, picked
 
 NORMAL_THRESHOLD = 30.0  # degrees
@@ -50,7 +51,7 @@ def disparity_mae(preds: NDArray[Any], target: NDArray[Any], mask: Mask) -> floa
         return float("nan")
     first, second = preds[mask].astype(np.float64), target[mask].astype(np.float64)
     if not ((first > 0).all() and (second > 0).all()):
-        raise ValueError("disparity_mae: unmasked depths must be > 0")
+        raise InvalidArgument("disparity_mae: unmasked depths must be > 0")
     return float(np.mean(np.abs(1.0 / first - 1.0 / second)))
 
 
@@ -68,7 +69,9 @@ def backproject(depth: NDArray[Any], cameras: Cameras, index: int) -> FloatArray
         [0.0, 0.0, -2.0]
     """
     if depth.shape != (cameras.height, cameras.width):
-        raise ValueError(f"backproject: depth must have shape {(cameras.height, cameras.width)}, got {depth.shape}")
+        raise InvalidArgument(
+            f"backproject: depth must have shape {(cameras.height, cameras.width)}, got {depth.shape}"
+        )
     origins, directions = cameras.rays(index)
     reachable = np.where(np.isfinite(depth), depth, np.nan).astype(np.float64)
     return origins + reachable[..., None] * directions
@@ -92,7 +95,7 @@ def normals_from_depth(depth: NDArray[Any], cameras: Cameras, index: int) -> Flo
     """
     positions = backproject(depth, cameras, index)
     if min(depth.shape) < 2:
-        raise ValueError(f"normals_from_depth: depth must be at least 2 x 2, got {depth.shape}")
+        raise InvalidArgument(f"normals_from_depth: depth must be at least 2 x 2, got {depth.shape}")
     down, right = np.gradient(positions, axis=(0, 1))
     cross = np.cross(down, right)
     length = np.linalg.norm(cross, axis=-1, keepdims=True)

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.errors import InvalidArgument
 from .checks import FloatArray, Mask, check_pair
 from .filters import correlate, gaussian_taps
 
@@ -90,9 +91,9 @@ def flip_map(preds: NDArray[Any], target: NDArray[Any], *, pixels_per_degree: fl
     """
     check_pair("flip_map", preds, target, np.ones(preds.shape[:2], dtype=bool), channels=True)
     if preds.shape[-1] != 3 or not preds.size:
-        raise ValueError(f"flip_map: preds must have shape (H, W, 3) with pixels, got {preds.shape}")
+        raise InvalidArgument(f"flip_map: preds must have shape (H, W, 3) with pixels, got {preds.shape}")
     if not (math.isfinite(pixels_per_degree) and pixels_per_degree > 0):
-        raise ValueError(f"flip_map: pixels_per_degree must be finite and > 0, got {pixels_per_degree}")
+        raise InvalidArgument(f"flip_map: pixels_per_degree must be finite and > 0, got {pixels_per_degree}")
     first, second = (_opponent(_checked(image, name)) for image, name in ((preds, "preds"), (target, "target")))
     colour = _redistribute(_hyab(_seen(first, pixels_per_degree), _seen(second, pixels_per_degree)))
     lightness = [(image[..., 0] + 16.0) / 116.0 for image in (first, second)]
@@ -104,7 +105,7 @@ def _checked(image: NDArray[Any], name: str) -> FloatArray:
     values = image.astype(np.float64)
     inside = (values >= -RANGE_SLACK) & (values <= 1 + RANGE_SLACK)
     if not inside.all():
-        raise ValueError(f"flip_map: {name} must lie in [0, 1], {int((~inside).sum())} values do not")
+        raise InvalidArgument(f"flip_map: {name} must lie in [0, 1], {int((~inside).sum())} values do not")
     return np.clip(values, 0.0, 1.0)
 
 

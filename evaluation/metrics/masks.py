@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.errors import InvalidArgument
 from .checks import Mask
 
 MASK_KEYS = ("dice", "iou", "mask_precision", "mask_recall", "pixel_accuracy")
@@ -21,7 +22,7 @@ def coverage(mask: Mask) -> float:
         0.75
     """
     if mask.dtype != np.bool_:
-        raise ValueError(f"coverage: mask must be bool, got {mask.dtype}")
+        raise InvalidArgument(f"coverage: mask must be bool, got {mask.dtype}")
     return float(mask.mean()) if mask.size else float("nan")
 
 
@@ -47,9 +48,11 @@ def mask_scores(preds: Mask, target: Mask) -> dict[str, float]:
     """
     for name, mask in (("preds", preds), ("target", target)):
         if mask.dtype != np.bool_:
-            raise ValueError(f"mask_scores: {name} must be bool, got {mask.dtype}")
+            raise InvalidArgument(f"mask_scores: {name} must be bool, got {mask.dtype}")
     if preds.shape != target.shape or not preds.size:
-        raise ValueError(f"mask_scores: masks must have one shape with pixels, got {preds.shape} and {target.shape}")
+        raise InvalidArgument(
+            f"mask_scores: masks must have one shape with pixels, got {preds.shape} and {target.shape}"
+        )
     both, p, t = int((preds & target).sum()), int(preds.sum()), int(target.sum())
     return {
         "dice": 2.0 * both / (p + t) if p + t else 1.0,
@@ -72,9 +75,9 @@ def predicted_mask(accumulation: NDArray[Any], *, threshold: float) -> Mask:
         [False, True]
     """
     if not 0 < threshold <= 1:
-        raise ValueError(f"predicted_mask: threshold must lie in (0, 1], got {threshold}")
+        raise InvalidArgument(f"predicted_mask: threshold must lie in (0, 1], got {threshold}")
     values = np.asarray(accumulation)
     if not ((values >= -1e-3) & (values <= 1 + 1e-3)).all():
         bad = int((~((values >= -1e-3) & (values <= 1 + 1e-3))).sum())
-        raise ValueError(f"predicted_mask: accumulation must lie in [0, 1], {bad} values do not")
+        raise InvalidArgument(f"predicted_mask: accumulation must lie in [0, 1], {bad} values do not")
     return np.asarray(values >= threshold, dtype=np.bool_)

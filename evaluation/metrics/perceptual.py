@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.errors import InvalidArgument, MissingExtra
 from .checks import FloatArray, Mask, check_pair, choose
 
 BACKBONES: Mapping[str, str] = MappingProxyType(  # the file torchvision's weights are stored under
@@ -25,7 +26,7 @@ LPIPS_CONVENTIONS: Mapping[str, tuple[bool, bool]] = MappingProxyType(  # (blank
 )
 
 
-class LpipsUnavailable(ImportError):
+class LpipsUnavailable(MissingExtra):
     """LPIPS cannot be computed here; the message says what is missing and where it would have to be."""
 
 
@@ -117,5 +118,5 @@ def lpips(
     second = np.where(kept, target, 0.0 if blanked else target).astype(np.float64)
     distances = np.asarray(network.distance_map(first, second))
     if distances.shape != mask.shape:
-        raise ValueError(f"lpips: distance_map must give shape {mask.shape}, got {distances.shape}")
+        raise InvalidArgument(f"lpips: distance_map must give shape {mask.shape}, got {distances.shape}")
     return float(distances[mask].mean() if over_mask else distances.mean())

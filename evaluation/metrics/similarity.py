@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.errors import InvalidArgument
 from .checks import FloatArray, Mask, check_pair, check_range, choose
 from .filters import correlate, gaussian_taps
 
@@ -120,7 +121,7 @@ def ssim_map(preds: NDArray[Any], target: NDArray[Any], *, data_range: float) ->
 def _check_finite(preds: NDArray[Any], target: NDArray[Any]) -> None:
     for name, image in (("preds", preds), ("target", target)):
         if not np.isfinite(image).all():
-            raise ValueError(f"ssim: {int((~np.isfinite(image)).sum())} values of {name} are NaN or infinite")
+            raise InvalidArgument(f"ssim: {int((~np.isfinite(image)).sum())} values of {name} are NaN or infinite")
 
 
 def _map(
@@ -129,7 +130,7 @@ def _map(
     height, width = preds.shape[:2]
     smallest = {"valid": 2 * SSIM_RADIUS + 1, "reflect": SSIM_RADIUS + 1}.get(border, 1)
     if min(height, width) < smallest:
-        raise ValueError(
+        raise InvalidArgument(
             f"ssim: an image must be at least {smallest} pixels wide and high here, got {height} x {width}"
         )
     taps = gaussian_taps(SSIM_RADIUS, SSIM_WIDTH)

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ...core.errors import InvalidArgument, InvalidFile, MissingFile
 from ...core.io import read_json, write_text
 from ...core.metrics import METRICS
 from ...core.pages import LineChart, Series, Table, line_chart, render
@@ -49,7 +50,7 @@ def page_text(results: Mapping[str, Any], pictures: Sequence[ViewPictures] = ())
     """
     rows = list(results.get("rows", ()))
     if not rows or not all(isinstance(row, Mapping) and "method" in row for row in rows):
-        raise ValueError("page_text: results must have rows, each with a method")
+        raise InvalidArgument("page_text: results must have rows, each with a method")
     methods = list(dict.fromkeys(str(row["method"]) for row in rows))
     few = len(methods) < 4
     colours = colours_of(methods)
@@ -89,11 +90,11 @@ def read_results(path: str | Path) -> dict[str, Any]:
     """
     source = Path(path)
     if not source.is_file():
-        raise FileNotFoundError(f"read_results: no file {source}")
+        raise MissingFile(f"read_results: no file {source}")
     found = read_json(source, caller="read_results")
     rows = found.get("rows") if isinstance(found, dict) else None
     if not isinstance(rows, list) or not rows or not all(isinstance(row, dict) and "method" in row for row in rows):
-        raise ValueError(f"read_results: {source} has no rows with a method each (docs/formats.md)")
+        raise InvalidFile(f"read_results: {source} has no rows with a method each (docs/formats.md)")
     return dict(found)
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.errors import InvalidArgument, MissingExtra
 from ...core.metrics import get_metric
 from ..metrics.checks import Mask
 from ..scoring.renders import Method
@@ -53,7 +54,7 @@ def worst_first(images: Sequence[Mapping[str, Any]], key: str) -> list[str]:
     """
     sortable = [each for each in (*OWN_KEYS, *EQUAL_KEYS) if get_metric(each).sign]
     if key not in sortable:
-        raise ValueError(f"worst_first: key must be one of {', '.join(sortable)}, got {key!r}")
+        raise InvalidArgument(f"worst_first: key must be one of {', '.join(sortable)}, got {key!r}")
 
     def badness(row: Mapping[str, Any]) -> tuple[bool, float]:
         infinite = key in row.get("infinite", ())
@@ -110,7 +111,7 @@ def jpeg(image: NDArray[Any]) -> bytes:
     try:
         from PIL import Image
     except ImportError as error:
-        raise ImportError("pictures need Pillow: pip install unghost[eval]") from error
+        raise MissingExtra("pictures need Pillow: pip install unghost[eval]") from error
     picture = Image.fromarray(np.round(np.clip(image, 0, 1) * 255).astype(np.uint8))
     factor = LARGEST_SIDE / max(picture.size)
     if factor < 1:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.errors import InvalidArgument, MissingExtra
 from ...core.results import json_ready
 from ..scoring.conventions import get_convention, one_convention
 
@@ -39,10 +40,10 @@ def mean_over_seeds(method: str, per_seed: Sequence[Mapping[str, Any]]) -> dict[
         ValueError: no seed, different keys, or scores of different conventions.
     """
     if not per_seed:
-        raise ValueError("mean_over_seeds: per_seed must hold at least one seed's scores")
+        raise InvalidArgument("mean_over_seeds: per_seed must hold at least one seed's scores")
     keys = list(per_seed[0])
     if any(set(scores) != set(keys) for scores in per_seed):
-        raise ValueError("mean_over_seeds: every seed must have the same keys")
+        raise InvalidArgument("mean_over_seeds: every seed must have the same keys")
     one_convention("mean_over_seeds", per_seed)
     row: dict[str, Any] = {"method": method}
     for key in keys:
@@ -85,7 +86,7 @@ def convention_rows(scores: Mapping[str, Mapping[str, Any]]) -> list[dict[str, A
     """
     for name, each in scores.items():
         if each.get("convention", name) != name:
-            raise ValueError(f"convention_rows: the scores given as {name!r} are of {each['convention']!r}")
+            raise InvalidArgument(f"convention_rows: the scores given as {name!r} are of {each['convention']!r}")
     keys = dict.fromkeys(key for name in scores for key in get_convention(name).keys)
     rows = []
     for key in keys:
@@ -142,7 +143,7 @@ def draw_comparison(
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise ImportError("draw_comparison needs matplotlib: pip install unghost[eval]") from error
+        raise MissingExtra("draw_comparison needs matplotlib: pip install unghost[eval]") from error
     blocks = 2 if len(views) > 1 else 1
     across = len(columns) * blocks
     down = 2 * -(-len(views) // blocks)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.errors import InvalidArgument
 from ...core.results import json_ready
 from ..metrics.checks import Mask
 from ..metrics.perceptual import Lpips
@@ -65,7 +66,7 @@ def choose_convention(name: str | None, methods: Sequence[Method], truth: Truth,
     lacking = lacking_maps(name, methods, truth, extent)
     if lacking:
         listed = "; ".join(f"{method}: {in_words(maps)}" for method, maps in lacking.items())
-        raise ValueError(
+        raise InvalidArgument(
             f"convention {name!r} needs what is not there ({listed}); what is there allows {', '.join(possible)}"
         )
     return name
@@ -118,10 +119,10 @@ def compare_methods(
     """
     names = [each.name for each in methods]
     if not names or len(set(names)) != len(names):
-        raise ValueError(f"compare_methods: methods must be at least one, of different names, got {names}")
+        raise InvalidArgument(f"compare_methods: methods must be at least one, of different names, got {names}")
     unknown = set(references) - set(names)
     if unknown:
-        raise ValueError(f"compare_methods: references must be among {names}, got {sorted(unknown)}")
+        raise InvalidArgument(f"compare_methods: references must be among {names}, got {sorted(unknown)}")
     draws = int(rng.integers(2**32))  # the same for every row: equal renders have equal intervals
     rule, asked = get_convention(convention), None if keys is None else tuple(keys)
     scores: dict[str, SceneScores] = {}

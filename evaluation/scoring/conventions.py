@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ...core.cameras import Cameras
+from ...core.errors import InvalidArgument
 from ..metrics.checks import Mask, choose
 from ..metrics.masks import predicted_mask
 from .protocol import depth_limit, depth_masks
@@ -186,7 +187,7 @@ class SceneExtent:
     def __post_init__(self) -> None:
         for name, value in (("limit", self.limit), ("unit", self.unit)):
             if not (np.isfinite(value) and value > 0):
-                raise ValueError(f"SceneExtent: {name} must be finite and > 0, got {value}")
+                raise InvalidArgument(f"SceneExtent: {name} must be finite and > 0, got {value}")
 
     @classmethod
     def of(cls, train_cameras: Cameras, eval_cameras: Cameras) -> SceneExtent:
@@ -222,7 +223,7 @@ def evaluation_masks(convention: Convention, renders: Renders, truth: Truth, ext
     """
     lacking = missing_maps(convention, renders, truth, extent_known=extent is not None)
     if lacking:
-        raise ValueError(f"evaluation_masks: convention {convention.name!r} needs {', '.join(lacking)}")
+        raise InvalidArgument(f"evaluation_masks: convention {convention.name!r} needs {', '.join(lacking)}")
     masks = claimed_masks(convention, renders, truth, extent)
     if convention.visible and truth.visible is not None:
         masks &= truth.visible
@@ -253,7 +254,7 @@ def one_convention(caller: str, rows: Iterable[Mapping[str, Any]]) -> Any:
         if first is None:
             first = here
         elif here[0] != first[0]:
-            raise ValueError(
+            raise InvalidArgument(
                 f"{caller}: conventions do not mix: {first[0]!r} (row {first[1]!r}) and {here[0]!r} (row {here[1]!r}) "
                 "must not stand in one table or column"
             )

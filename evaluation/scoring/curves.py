@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.errors import InvalidArgument
 from ...core.metrics import get_metric
 from ..metrics.checks import Mask
 from .conventions import one_convention
@@ -91,10 +92,10 @@ class Curve:
             if c is not None and s is not None and np.isfinite(c) and np.isfinite(s)
         ]
         if not known:
-            raise ValueError(f"Curve.create: {method!r} has no row with a finite {metric} and coverage")
+            raise InvalidArgument(f"Curve.create: {method!r} has no row with a finite {metric} and coverage")
         outside = [c for c, _, _ in known if not 0 <= c <= 1]
         if outside:
-            raise ValueError(f"Curve.create: coverage of {method!r} must lie in [0, 1], got {outside[0]}")
+            raise InvalidArgument(f"Curve.create: coverage of {method!r} must lie in [0, 1], got {outside[0]}")
         worst_first = sorted(known, key=lambda each: (each[0], each[1] if higher_is_better else -each[1]))
         kept: list[tuple[float, float, float]] = []
         for each in worst_first:
@@ -123,7 +124,7 @@ class Curve:
             ValueError: not ``low < high``.
         """
         if not low < high:
-            raise ValueError(f"Curve.area: low must be < high, got {low} and {high}")
+            raise InvalidArgument(f"Curve.area: low must be < high, got {low} and {high}")
         ends = self.at(low), self.at(high)
         if ends[0] is None or ends[1] is None:
             return None
@@ -174,7 +175,7 @@ def compare(curves: Sequence[Curve], *, coverage: float | None = None) -> list[d
     """
     _comparable("compare", curves)
     if coverage is not None and not 0 <= coverage <= 1:
-        raise ValueError(f"compare: coverage must lie in [0, 1], got {coverage}")
+        raise InvalidArgument(f"compare: coverage must lie in [0, 1], got {coverage}")
     shared = common_range(curves)
     if coverage is None and shared is not None:
         coverage = shared[1]
@@ -250,16 +251,16 @@ def cut_to_coverage(mask: Mask, confidence: NDArray[Any], *, coverage: float) ->
         [[False, True, True, False]]
     """
     if mask.dtype != np.bool_ or mask.shape != confidence.shape:
-        raise ValueError(
+        raise InvalidArgument(
             f"cut_to_coverage: mask must be bool of the shape of confidence {confidence.shape}, got {mask.dtype} "
             f"{mask.shape}"
         )
     if not 0 <= coverage <= 1:
-        raise ValueError(f"cut_to_coverage: coverage must lie in [0, 1], got {coverage}")
+        raise InvalidArgument(f"cut_to_coverage: coverage must lie in [0, 1], got {coverage}")
     candidates = np.flatnonzero(mask)
     sureness = np.asarray(confidence, dtype=np.float64).ravel()[candidates]
     if np.isnan(sureness).any():
-        raise ValueError(f"cut_to_coverage: {int(np.isnan(sureness).sum())} confidences in the mask are NaN")
+        raise InvalidArgument(f"cut_to_coverage: {int(np.isnan(sureness).sum())} confidences in the mask are NaN")
     keep = min(int(coverage * mask.size + 1e-9), len(candidates))
     kept = np.zeros(mask.size, dtype=np.bool_)
     kept[candidates[np.argsort(-sureness, kind="stable")[:keep]]] = True
@@ -268,11 +269,11 @@ def cut_to_coverage(mask: Mask, confidence: NDArray[Any], *, coverage: float) ->
 
 def _comparable(caller: str, curves: Sequence[Curve]) -> None:
     if not curves:
-        raise ValueError(f"{caller}: curves must hold at least one")
+        raise InvalidArgument(f"{caller}: curves must hold at least one")
     one_convention(caller, [{"method": each.method, "convention": each.convention} for each in curves])
     metrics = {(each.metric, each.higher_is_better): each.method for each in curves}
     if len(metrics) > 1:
         listed = " and ".join(f"{key[0]!r} (curve {method!r})" for key, method in metrics.items())
-        raise ValueError(f"{caller}: curves of one metric only, got {listed}")
+        raise InvalidArgument(f"{caller}: curves of one metric only, got {listed}")
     if len({each.method for each in curves}) != len(curves):
-        raise ValueError(f"{caller}: methods must have different names, got {[each.method for each in curves]}")
+        raise InvalidArgument(f"{caller}: methods must have different names, got {[each.method for each in curves]}")

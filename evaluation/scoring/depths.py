@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.cameras import Cameras
+from ...core.errors import InvalidArgument
 
 
 def optical_depth(depth: NDArray[Any], cameras: Cameras) -> NDArray[np.float64]:
@@ -24,5 +25,5 @@ def _cosines(caller: str, depth: NDArray[Any], cameras: Cameras) -> NDArray[np.f
     """Of each pixel's ray with the optical axis ``(n, H, W)``."""
     shape = (len(cameras), cameras.height, cameras.width)
     if np.shape(depth) != shape:
-        raise ValueError(f"{caller}: depth must have shape {shape}, got {np.shape(depth)}")
+        raise InvalidArgument(f"{caller}: depth must have shape {shape}, got {np.shape(depth)}")
     return np.stack([cameras.rays(index)[1] @ -cameras.camera_to_world[index, :, 2] for index in range(len(cameras))])

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.errors import InvalidArgument
 from ..metrics import pixelwise as metrics
 from ..metrics.checks import Mask
 from ..metrics.perceptual import Lpips, lpips
@@ -129,7 +130,7 @@ def score_scene(
     masks, claimed = (find(rule, renders, truth, extent) for find in (evaluation_masks, claimed_masks))
     if within is not None:
         if within.dtype != np.bool_ or within.shape != masks.shape:
-            raise ValueError(
+            raise InvalidArgument(
                 f"score_scene: within must be bool of shape {masks.shape}, got {within.dtype} {within.shape}"
             )
         masks, claimed = masks & within, claimed & within
@@ -137,9 +138,9 @@ def score_scene(
     wanted = rule.keys if keys is None else tuple(keys)
     for key in wanted if keys is not None else ():
         if key not in rule.keys:
-            raise ValueError(f"score_scene: {convention!r} does not define {key!r}; it has {', '.join(rule.keys)}")
+            raise InvalidArgument(f"score_scene: {convention!r} does not define {key!r}; it has {', '.join(rule.keys)}")
         if key in notes:
-            raise ValueError(f"score_scene: {key} was asked for, but {notes[key]}")
+            raise InvalidArgument(f"score_scene: {key} was asked for, but {notes[key]}")
     wanted = tuple(key for key in wanted if key not in notes)
     rows = []
     for index, name in enumerate(truth.names):
@@ -196,12 +197,12 @@ def summarize(
         ValueError: no scene, two conventions or two LPIPS backbones (both named).
     """
     if not scenes:
-        raise ValueError("summarize: scenes must hold at least one scene's scores")
+        raise InvalidArgument("summarize: scenes must hold at least one scene's scores")
     for attribute in ("convention", "lpips_backbone"):
         found = {getattr(each, attribute): name for name, each in scenes.items()}
         if len(found) > 1:
             listed = " and ".join(f"{value!r} (scene {name!r})" for value, name in found.items())
-            raise ValueError(f"summarize: scenes of one {attribute} only, got {listed}")
+            raise InvalidArgument(f"summarize: scenes of one {attribute} only, got {listed}")
     first = next(iter(scenes.values()))
     rule = get_convention(first.convention)
     row: dict[str, Any] = {"method": method, "convention": rule.name}

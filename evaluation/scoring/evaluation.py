@@ -9,6 +9,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
+from ...core.errors import InvalidArgument
 from ..metrics.perceptual import Lpips, LpipsUnavailable, load_lpips
 from ..report.pictures import worst_first
 from .comparison import choose_convention, compare_methods, in_words, lacking_maps
@@ -98,9 +99,9 @@ def evaluate(
     sort = _sort_key(sort, metrics)  # refused before anything is read
     first, second = _named("against", against), _named("renders", renders)
     if not second:
-        raise ValueError("evaluate: no folder of renders is given")
+        raise InvalidArgument("evaluate: no folder of renders is given")
     for name in first.keys() & second.keys():
-        raise ValueError(f"evaluate: two methods are called {name!r}, one of them in against")
+        raise InvalidArgument(f"evaluate: two methods are called {name!r}, one of them in against")
     if isinstance(ground_truth, Truth):
         _refuse_options(masks, downscale, eval_split, train_split, normalize, occlusion, min_views)
         against_what = GroundTruth(IN_MEMORY, ground_truth)
@@ -159,7 +160,7 @@ def _sort_key(sort: str | None, metrics: Sequence[str]) -> str:
     key = sort or ("psnr" if not metrics or "psnr" in metrics else metrics[0])
     worst_first([], key)
     if metrics and key not in metrics:
-        raise ValueError(f"evaluate: sort must be one of the metrics {' '.join(metrics)}, got {key!r}")
+        raise InvalidArgument(f"evaluate: sort must be one of the metrics {' '.join(metrics)}, got {key!r}")
     return key
 
 
@@ -170,7 +171,7 @@ def _check_sort(results: Results) -> None:
     unsorted = all(each.get(key) is None and key not in each["infinite"] for each in images)
     if unsorted and any(each["pixels"] for each in images):  # with no pixel left at all, any order is as good
         known = [name for name in images[0] if any(isinstance(each[name], float) for each in images)]
-        raise ValueError(f"evaluate: no view of {main['method']} has a {key} to sort by, but {', '.join(known)}")
+        raise InvalidArgument(f"evaluate: no view of {main['method']} has a {key} to sort by, but {', '.join(known)}")
 
 
 def _named(argument: str, given: Methods) -> dict[str, OneMethod]:
@@ -187,7 +188,7 @@ def _named(argument: str, given: Methods) -> dict[str, OneMethod]:
         else:
             name = Path(each).resolve().name
         if name in found:
-            raise ValueError(f"evaluate: two methods are called {name!r} ({found[name]} and {each}); name them")
+            raise InvalidArgument(f"evaluate: two methods are called {name!r} ({found[name]} and {each}); name them")
         found[name] = each
     return found
 
@@ -204,7 +205,7 @@ def _along_rays(method: Method, truth: Truth, depth_along: str) -> Method:
     if depth_along == "ray":
         return method
     if truth.cameras is None:
-        raise ValueError("evaluate: depth_along axis needs the cameras: masks.npz, or a capture as ground truth")
+        raise InvalidArgument("evaluate: depth_along axis needs the cameras: masks.npz, or a capture as ground truth")
     depth = method.renders.depth
     if depth is None:
         return method
@@ -232,7 +233,7 @@ def _refuse_options(
     }
     named = [option for option, is_given in given.items() if is_given]
     if named:
-        raise ValueError(f"evaluate: {', '.join(named)} must be left out with ground truth in memory (Truth)")
+        raise InvalidArgument(f"evaluate: {', '.join(named)} must be left out with ground truth in memory (Truth)")
 
 
 def _network(backbone: Backbone | Lpips, metrics: Sequence[str]) -> tuple[Lpips | None, list[str]]:

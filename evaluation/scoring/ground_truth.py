@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.cameras import Cameras
+from ...core.errors import InvalidArgument, InvalidFile
 from ..captures.colmap import find_model
 from ..captures.loading import load_capture
 from ..captures.splits import EVAL_NAMES, TRAIN_NAMES, choose_split
@@ -88,7 +89,7 @@ def read_ground_truth(
     for option, given in (("occlusion", occlusion is not None), ("min_views", min_views != 1)):
         if given:
             held = "no masks" if masks is None else f"the pictures in {masks}"
-            raise ValueError(f"evaluate: {option} needs masks.npz (of unghost masks) as masks, got {held}")
+            raise InvalidFile(f"evaluate: {option} needs masks.npz (of unghost masks) as masks, got {held}")
     visible = None if masks is None else read_masks(masks, found.names, found.shape)
     extent, notes = _extent(found)
     truth = Truth(found.photos, visible, cameras=found.cameras, names=found.names)
@@ -107,7 +108,7 @@ def _with_stored_masks(
     height, width = found.shape
     size = stored.eval_cameras.width, stored.eval_cameras.height
     if (width, height) != size:
-        raise ValueError(
+        raise InvalidArgument(
             f"evaluate: the photos are {width} x {height}, {masks} is of {size[0]} x {size[1]}; see downscale "
             f"(now {downscale:g})"
         )

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.errors import InvalidArgument
+
 FloatArray = NDArray[np.float64]
 RESAMPLES = 1000
 
@@ -105,7 +107,7 @@ def bootstrap_scenes(
     """
     _check("bootstrap_scenes", level, resamples)
     if mean_over not in ("scenes", "images"):
-        raise ValueError(f"bootstrap_scenes: mean_over must be scenes or images, got {mean_over!r}")
+        raise InvalidArgument(f"bootstrap_scenes: mean_over must be scenes or images, got {mean_over!r}")
     split = [defined(values) for values in scenes.values()]
     known = [values for values, _ in split if len(values)]
     undefined, count = sum(each for _, each in split), sum(map(len, known))
@@ -147,7 +149,9 @@ def bootstrap_difference(
     """
     _check("bootstrap_difference", level, resamples)
     if len(first) != len(second):
-        raise ValueError(f"bootstrap_difference: first and second must pair up, got {len(first)} and {len(second)}")
+        raise InvalidArgument(
+            f"bootstrap_difference: first and second must pair up, got {len(first)} and {len(second)}"
+        )
     pairs = np.array([[np.nan if v is None else v for v in pair] for pair in zip(first, second)]).reshape(-1, 2)
     usable = np.isfinite(pairs).all(axis=1)
     difference: list[float | None] = [*(pairs[usable, 0] - pairs[usable, 1]), *[None] * int((~usable).sum())]
@@ -156,9 +160,9 @@ def bootstrap_difference(
 
 def _check(caller: str, level: float, resamples: int) -> None:
     if not 0 < level < 1:
-        raise ValueError(f"{caller}: level must lie in (0, 1), got {level}")
+        raise InvalidArgument(f"{caller}: level must lie in (0, 1), got {level}")
     if resamples < 1:
-        raise ValueError(f"{caller}: resamples must be >= 1, got {resamples}")
+        raise InvalidArgument(f"{caller}: resamples must be >= 1, got {resamples}")
 
 
 def _ends(means: FloatArray, level: float) -> tuple[float, float]:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.cameras import Cameras
+from ...core.errors import InvalidArgument
 from ..metrics.checks import Mask
 from ..metrics.geometry import backproject
 from .depths import optical_depth
@@ -35,7 +36,9 @@ def depth_limit(train_cameras: Cameras, eval_cameras: Cameras) -> float:
     origins = np.concatenate([train_cameras.origins, eval_cameras.origins])
     largest = max((float(np.linalg.norm(origins - origin, axis=1).max()) for origin in origins), default=0.0)
     if not largest > 0:
-        raise ValueError(f"depth_limit: needs two distinct camera origins, got {len(origins)} cameras in one place")
+        raise InvalidArgument(
+            f"depth_limit: needs two distinct camera origins, got {len(origins)} cameras in one place"
+        )
     return 2.0 * largest
 
 
@@ -58,7 +61,7 @@ def visibility_masks(
         ``(n, H, W)`` bool.
     """
     if minimum_views < 1:
-        raise ValueError(f"visibility_masks: minimum_views must be >= 1, got {minimum_views}")
+        raise InvalidArgument(f"visibility_masks: minimum_views must be >= 1, got {minimum_views}")
     counts = view_counts(eval_cameras, pseudo_depth, train_cameras, train_depth=train_depth, tolerance=tolerance)
     return np.asarray(counts >= minimum_views, dtype=np.bool_)
 
@@ -103,16 +106,16 @@ def view_counts(
 def depth_masks(depth: NDArray[Any], limit: float) -> Mask:
     """``depth < limit`` for predicted depths ``(n, H, W)``; a field that removed all it had has none left."""
     if not limit > 0:
-        raise ValueError(f"depth_masks: limit must be > 0, got {limit}")
+        raise InvalidArgument(f"depth_masks: limit must be > 0, got {limit}")
     return np.asarray(np.asarray(depth) < limit, dtype=np.bool_)
 
 
 def common_mask(masks: Sequence[Mask]) -> Mask:
     """Pixels that count for *every* compared method: the only ones on which their PSNRs are comparable."""
     if not masks:
-        raise ValueError("common_mask: needs at least one mask")
+        raise InvalidArgument("common_mask: needs at least one mask")
     if len({mask.shape for mask in masks}) != 1:
-        raise ValueError(f"common_mask: masks must have one shape, got {[mask.shape for mask in masks]}")
+        raise InvalidArgument(f"common_mask: masks must have one shape, got {[mask.shape for mask in masks]}")
     return np.asarray(np.logical_and.reduce(list(masks)), dtype=np.bool_)
 
 
@@ -120,8 +123,8 @@ def _depths(caller: str, depth: NDArray[Any], cameras: Cameras, name: str) -> ND
     shape = (len(cameras), cameras.height, cameras.width)
     array = np.asarray(depth, dtype=np.float64)
     if array.shape != shape:
-        raise ValueError(f"{caller}: {name} must have shape {shape}, got {array.shape}")
+        raise InvalidArgument(f"{caller}: {name} must have shape {shape}, got {array.shape}")
     if np.isnan(array).any() or not (array > 0).all():
         bad = int((~(array > 0)).sum())
-        raise ValueError(f"{caller}: {name} must be > 0 (inf for nothing), {bad} values are not")
+        raise InvalidArgument(f"{caller}: {name} must be > 0 (inf for nothing), {bad} values are not")
     return array

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.cameras import Cameras
+from ...core.errors import InvalidArgument, InvalidFile
 from ...core.io import write_npz
 from ..metrics.checks import Mask
 from ..metrics.geometry import normals_from_depth
@@ -73,9 +74,9 @@ class PseudoTruth:
             ValueError: ``minimum_views < 1``, or occlusion asked of maps that were made without training depth.
         """
         if minimum_views < 1:
-            raise ValueError(f"PseudoTruth.visible: minimum_views must be >= 1, got {minimum_views}")
+            raise InvalidArgument(f"PseudoTruth.visible: minimum_views must be >= 1, got {minimum_views}")
         if occlusion and self.seen_open is None:
-            raise ValueError("PseudoTruth.visible: occlusion needs maps made with train_depth; these were not")
+            raise InvalidArgument("PseudoTruth.visible: occlusion needs maps made with train_depth; these were not")
         counts = self.seen_open if occlusion and self.seen_open is not None else self.seen_frustum
         return np.asarray(counts >= minimum_views, dtype=np.bool_)
 
@@ -144,7 +145,7 @@ def make_pseudo_truth(
     try:
         json.dumps(dict(details or {}), allow_nan=False)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"make_pseudo_truth: details must be JSON without NaN ({error})") from None
+        raise InvalidArgument(f"make_pseudo_truth: details must be JSON without NaN ({error})") from None
     result = PseudoTruth(
         eval_cameras,
         train_cameras,
@@ -192,9 +193,9 @@ def load_pseudo_truth(
         _check("load_pseudo_truth", result)
         stated = float(manifest["depth_limit"])
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"load_pseudo_truth: {source} is inconsistent: {error}") from None
+        raise InvalidFile(f"load_pseudo_truth: {source} is inconsistent: {error}") from None
     if not np.isclose(stated, result.extent.limit, rtol=1e-9):
-        raise ValueError(
+        raise InvalidFile(
             f"load_pseudo_truth: {source} is inconsistent: depth_limit {stated} for cameras of {result.extent.limit}"
         )
     check_cameras(source, result, eval_cameras=eval_cameras, train_cameras=train_cameras)
@@ -229,19 +230,19 @@ def _read(source: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         zipfile.BadZipFile,
         zlib.error,
     ) as error:
-        raise ValueError(f"{caller}: {source} is not pseudo ground truth, or is truncated ({error})") from None
+        raise InvalidFile(f"{caller}: {source} is not pseudo ground truth, or is truncated ({error})") from None
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
-        raise ValueError(f"{caller}: {source} is not pseudo ground truth (format must be {FORMAT!r})")
+        raise InvalidFile(f"{caller}: {source} is not pseudo ground truth (format must be {FORMAT!r})")
     if manifest.get("format_version") != FORMAT_VERSION:
-        raise ValueError(
+        raise InvalidFile(
             f"{caller}: {source} has version {manifest.get('format_version')!r}, this release reads {FORMAT_VERSION}"
         )
     hashes = manifest.get("sha256")
     if not isinstance(hashes, dict) or set(hashes) != set(arrays):
-        raise ValueError(f"{caller}: {source}: sha256 must name exactly the arrays {sorted(arrays)}")
+        raise InvalidFile(f"{caller}: {source}: sha256 must name exactly the arrays {sorted(arrays)}")
     for name, values in arrays.items():
         if values.dtype != _dtype(name) or _digest(values) != hashes[name]:
-            raise ValueError(f"{caller}: {source} was altered: {name} does not match its hash or is no {_dtype(name)}")
+            raise InvalidFile(f"{caller}: {source} was altered: {name} does not match its hash or is no {_dtype(name)}")
     return manifest, arrays
 
 
@@ -257,20 +258,20 @@ def _check(caller: str, maps: PseudoTruth) -> None:
     for name, each in wanted.items():
         values = getattr(maps, name)
         if values is not None and values.shape != each:
-            raise ValueError(f"{caller}: {name} must have shape {each}, got {values.shape}")
+            raise InvalidArgument(f"{caller}: {name} must have shape {each}, got {values.shape}")
     check_depth(caller, "depth", maps.depth)
     check_normals(caller, "normals", maps.normals)
     if len(maps.names) != shape[0] or len(set(maps.names)) != shape[0]:
-        raise ValueError(f"{caller}: names must be {shape[0]} different ones, got {list(maps.names)}")
+        raise InvalidArgument(f"{caller}: names must be {shape[0]} different ones, got {list(maps.names)}")
     if (maps.tolerance is None) != (maps.seen_open is None):
-        raise ValueError(f"{caller}: tolerance must be there if and only if seen_open is, got {maps.tolerance}")
+        raise InvalidArgument(f"{caller}: tolerance must be there if and only if seen_open is, got {maps.tolerance}")
 
 
 def _check_cameras(source: Path, side: str, stored: Cameras, wanted: Cameras) -> None:
     here = (len(wanted), wanted.width, wanted.height)
     there = (len(stored), stored.width, stored.height)
     if here != there:
-        raise ValueError(
+        raise InvalidFile(
             f"load_pseudo_truth: {source} is of {there[0]} {side} cameras of {there[1]} x {there[2]}, not of {here[0]} "
             f"of {here[1]} x {here[2]}"
         )
@@ -280,7 +281,7 @@ def _check_cameras(source: Path, side: str, stored: Cameras, wanted: Cameras) ->
         apart = np.abs(first - second).reshape(len(first), -1).max(axis=1, initial=0.0) / size
         if (apart > SAME_CAMERA).any():
             worst = int(apart.argmax())
-            raise ValueError(
+            raise InvalidFile(
                 f"load_pseudo_truth: {source} is of other {side} cameras: {name} of camera {worst} is off by "
                 f"{apart[worst] * size:.3g}"
             )

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.errors import InvalidArgument, InvalidFile, MissingExtra, MissingFile
 from ..metrics.checks import Mask
 from .views import Renders
 
@@ -73,7 +74,7 @@ def read_method(name: str, folder: str | Path, views: Sequence[str], shape: tupl
     colours = _stack(paths, shape)
     both = [key for key in KNOBS if maps[key] is not None]
     if len(both) > 1:
-        raise ValueError(f"read_method: {source} has both confidence and uncertainty maps; keep one")
+        raise InvalidFile(f"read_method: {source} has both confidence and uncertainty maps; keep one")
     confidence = None
     if both:
         values = maps[both[0]]
@@ -81,7 +82,7 @@ def read_method(name: str, folder: str | Path, views: Sequence[str], shape: tupl
     try:
         renders = Renders(colours, maps["depth"], maps["accumulation"], maps["normals"])
     except ValueError as error:
-        raise ValueError(f"{error} (in {source})") from None
+        raise InvalidFile(f"{error} (in {source})") from None
     return Method(name, renders, confidence)
 
 
@@ -103,7 +104,7 @@ def read_photos(
         ValueError: no photo, photos of ``views`` that are missing, of two sizes, transparent or undecodable.
     """
     if not downscale >= 1:
-        raise ValueError(f"read_photos: downscale must be >= 1, got {downscale}")
+        raise InvalidArgument(f"read_photos: downscale must be >= 1, got {downscale}")
     source = Path(folder)
     found = _pictures(source)
     names = tuple(found) if views is None else tuple(views)
@@ -111,7 +112,7 @@ def read_photos(
     paths = [found[key] for key in keys]
     sizes = {_size(path) for path in paths}
     if len(sizes) > 1:
-        raise ValueError(f"read_photos: the photos of {source} must have one size, got {_listed(map(_times, sizes))}")
+        raise InvalidFile(f"read_photos: the photos of {source} must have one size, got {_listed(map(_times, sizes))}")
     width, height = sizes.pop()
     shape = max(1, round(height / downscale)), max(1, round(width / downscale))
     return names, _stack(paths, shape, resize=True)
@@ -134,7 +135,7 @@ def read_masks(folder: str | Path, views: Sequence[str], shape: tuple[int, int])
         ends = [each for each in flat if stem == each or stem.endswith(f"_{each}")]
         view = flat[max(ends, key=len)] if ends and stem not in flat.values() else stem
         if view in found:
-            raise ValueError(f"{source} has two masks of {view}: {found[view].name} and {path.name}")
+            raise InvalidFile(f"{source} has two masks of {view}: {found[view].name} and {path.name}")
         found[view] = path
     keys = match_names("masks", list(found), views, where=str(source), whole=False)
     return np.asarray(_stack([found[key] for key in keys], shape).mean(axis=-1) >= 0.5, dtype=np.bool_)
@@ -199,7 +200,7 @@ def match_names(
     missing, surplus = best or ([], [])
     said = [f"{len(missing)} of {len(views)} views have none ({_listed(missing)})"] if missing else []
     said += [f"{len(surplus)} belong to no view ({_listed(surplus)})"] if surplus else []
-    raise ValueError(f"match_names: {what} in {where} do not match the views: {'; '.join(said) or 'names repeat'}")
+    raise InvalidFile(f"match_names: {what} in {where} do not match the views: {'; '.join(said) or 'names repeat'}")
 
 
 def _stem(name: str) -> str:
@@ -215,7 +216,7 @@ def _listed(names: Any) -> str:
 def _pictures(folder: Path, skip: Sequence[str] = ()) -> dict[str, Path]:
     """Name without ending -> path, in the order of names; folders in ``skip`` are left out."""
     if not folder.is_dir():
-        raise FileNotFoundError(f"no folder {folder}")
+        raise MissingFile(f"no folder {folder}")
     found: dict[str, Path] = {}
     for path in sorted(folder.rglob("*")):
         inner = path.relative_to(folder)
@@ -223,10 +224,10 @@ def _pictures(folder: Path, skip: Sequence[str] = ()) -> dict[str, Path]:
             continue
         name = inner.with_suffix("").as_posix()
         if name in found:
-            raise ValueError(f"{folder} has {name} twice: {found[name].name} and {path.name}")
+            raise InvalidFile(f"{folder} has {name} twice: {found[name].name} and {path.name}")
         found[name] = path
     if not found:
-        raise ValueError(f"{folder} holds no pictures ({', '.join(PICTURES)})")
+        raise InvalidFile(f"{folder} holds no pictures ({', '.join(PICTURES)})")
     return found
 
 
@@ -234,12 +235,12 @@ def _archive(path: Path, key: str) -> tuple[list[str], Any]:
     loaded: Mapping[str, Any] = _load(path)
     foreign = set(loaded) - {"names", *MAPS}
     if foreign:
-        raise ValueError(f"{path} holds {_listed(foreign)}; it may hold names, {', '.join(MAPS)}")
+        raise InvalidFile(f"{path} holds {_listed(foreign)}; it may hold names, {', '.join(MAPS)}")
     if key not in loaded:
         return [], None
     names, values = loaded.get("names"), loaded[key]
     if names is None or names.dtype.kind != "U" or names.ndim != 1 or len(names) != len(values):
-        raise ValueError(f"{path} must hold names, one text for each of the {len(values)} maps of {key}")
+        raise InvalidFile(f"{path} must hold names, one text for each of the {len(values)} maps of {key}")
     return [str(name) for name in names], values
 
 
@@ -252,12 +253,12 @@ def _load(path: Path) -> Any:
         loaded = np.load(path, allow_pickle=False)
         return loaded if isinstance(loaded, np.ndarray) else {name: loaded[name] for name in loaded.files}
     except (OSError, EOFError, ValueError, zlib.error, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path} is no .npy or .npz of numbers and text ({type(error).__name__})") from None
+        raise InvalidFile(f"{path} is no .npy or .npz of numbers and text ({type(error).__name__})") from None
 
 
 def _checked(where: str, values: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
     if values.shape[1:] != shape or not np.issubdtype(values.dtype, np.floating):
-        raise ValueError(
+        raise InvalidFile(
             f"{where} must be floating point of shape {shape} a view, got {values.dtype} {values.shape[1:]}"
         )
     return values
@@ -273,7 +274,7 @@ def _size(path: Path) -> tuple[int, int]:
         with image.open(path) as picture:
             return int(picture.width), int(picture.height)
     except (OSError, image.DecompressionBombError) as error:
-        raise ValueError(f"cannot read {path} ({error})") from None
+        raise InvalidFile(f"cannot read {path} ({error})") from None
 
 
 def _stack(paths: Sequence[Path], shape: tuple[int, int], *, resize: bool = False) -> NDArray[np.float32]:
@@ -283,7 +284,7 @@ def _stack(paths: Sequence[Path], shape: tuple[int, int], *, resize: bool = Fals
     if other:
         factor = wanted[0] / other[0][1][0]
         hint = f"; the photos are {factor:.4g} times as wide (see downscale)" if factor > 1 else ""
-        raise ValueError(
+        raise InvalidFile(
             f"{len(other)} of {len(paths)} pictures in {other[0][0].parent} are not {_times(wanted)} as the photos "
             f"are: {_listed(f'{path.name} is {_times(size)}' for path, size in other)}{hint}"
         )
@@ -295,19 +296,19 @@ def _read(path: Path, size: tuple[int, int]) -> NDArray[np.float32]:
     try:
         with image.open(path) as picture:
             if picture.mode not in EIGHT_BITS:
-                raise ValueError(f"{path} has pixels of kind {picture.mode}, not 8-bit colours")
+                raise InvalidFile(f"{path} has pixels of kind {picture.mode}, not 8-bit colours")
             if picture.mode in ("RGBA", "LA", "PA") and picture.getchannel("A").getextrema()[0] < 255:
-                raise ValueError(f"{path} has transparent pixels; put it on a background first")
+                raise InvalidFile(f"{path} has transparent pixels; put it on a background first")
             plain = picture.convert("RGB")
             small = plain if plain.size == size else plain.resize(size, image.Resampling.BOX)
             return np.asarray(small, dtype=np.float32) / np.float32(255)
     except (OSError, image.DecompressionBombError) as error:
-        raise ValueError(f"cannot decode {path} ({error})") from None
+        raise InvalidFile(f"cannot decode {path} ({error})") from None
 
 
 def _pillow() -> Any:
     try:
         from PIL import Image
     except ImportError as error:
-        raise ImportError("reading pictures needs Pillow: pip install unghost[eval]") from error
+        raise MissingExtra("reading pictures needs Pillow: pip install unghost[eval]") from error
     return Image

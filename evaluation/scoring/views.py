@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.cameras import Cameras
+from ...core.errors import InvalidArgument
 from ..metrics.checks import Mask
 from ..metrics.geometry import normals_from_depth
 
@@ -17,24 +18,26 @@ COLOUR_SLACK = 1e-4  # renderers overshoot [0, 1] by rounding; more is refused, 
 
 def _colours(caller: str, name: str, values: NDArray[Any]) -> None:
     if values.ndim != 4 or values.shape[-1] != 3 or not values.size:
-        raise ValueError(f"{caller}: {name} must have shape (n, H, W, 3) with pixels, got {values.shape}")
+        raise InvalidArgument(f"{caller}: {name} must have shape (n, H, W, 3) with pixels, got {values.shape}")
     if not np.issubdtype(values.dtype, np.floating):
-        raise ValueError(f"{caller}: {name} must be floating point in [0, 1], got {values.dtype}: divide by 255 first")
+        raise InvalidArgument(
+            f"{caller}: {name} must be floating point in [0, 1], got {values.dtype}: divide by 255 first"
+        )
     inside = (values >= -COLOUR_SLACK) & (values <= 1 + COLOUR_SLACK)
     if not inside.all():
-        raise ValueError(f"{caller}: {name} must lie in [0, 1], {int((~inside).sum())} values do not (NaN counts)")
+        raise InvalidArgument(f"{caller}: {name} must lie in [0, 1], {int((~inside).sum())} values do not (NaN counts)")
 
 
 def _map_shape(caller: str, name: str, values: NDArray[Any] | None, shape: tuple[int, ...]) -> None:
     if values is not None and values.shape != shape:
-        raise ValueError(f"{caller}: {name} must have shape {shape}, got {values.shape}")
+        raise InvalidArgument(f"{caller}: {name} must have shape {shape}, got {values.shape}")
 
 
 def check_depth(caller: str, name: str, values: NDArray[Any] | None) -> None:
     """Depth must be > 0; inf is "no surface"; NaN is refused and counted."""
     if values is not None and not (values > 0).all():
         bad, nan = int((~(values > 0)).sum()), int(np.isnan(values).sum())
-        raise ValueError(f"{caller}: {name} must be > 0 (inf for no surface), {bad} values are not ({nan} NaN)")
+        raise InvalidArgument(f"{caller}: {name} must be > 0 (inf for no surface), {bad} values are not ({nan} NaN)")
 
 
 def check_normals(caller: str, name: str, values: NDArray[Any] | None) -> None:
@@ -45,7 +48,7 @@ def check_normals(caller: str, name: str, values: NDArray[Any] | None) -> None:
     length = np.linalg.norm(np.where(none[..., None], 0.0, values), axis=-1)
     bad = int((~none & ~(np.abs(length - 1.0) <= 1e-3)).sum())
     if bad:
-        raise ValueError(f"{caller}: {name} must be unit vectors, or NaN for none; {bad} are not")
+        raise InvalidArgument(f"{caller}: {name} must be unit vectors, or NaN for none; {bad} are not")
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,16 +107,18 @@ class Truth:
         _map_shape("Truth", "depth", self.depth, shape)
         _map_shape("Truth", "normals", self.normals, (*shape, 3))
         if self.visible is not None and self.visible.dtype != np.bool_:
-            raise ValueError(f"Truth: visible must be bool, got {self.visible.dtype}")
+            raise InvalidArgument(f"Truth: visible must be bool, got {self.visible.dtype}")
         check_depth("Truth", "depth", self.depth)
         check_normals("Truth", "normals", self.normals)
         if self.cameras is not None:
             found = (len(self.cameras), self.cameras.height, self.cameras.width)
             if found != shape:
-                raise ValueError(f"Truth: cameras must be {shape} (n, H, W), got {found}")
+                raise InvalidArgument(f"Truth: cameras must be {shape} (n, H, W), got {found}")
         names = tuple(self.names) or tuple(str(index) for index in range(shape[0]))
         if len(names) != shape[0] or len(set(names)) != len(names):
-            raise ValueError(f"Truth: names must be {shape[0]} different ones, got {len(names)} ({len(set(names))})")
+            raise InvalidArgument(
+                f"Truth: names must be {shape[0]} different ones, got {len(names)} ({len(set(names))})"
+            )
         object.__setattr__(self, "names", names)
 
     def __len__(self) -> int:
@@ -123,7 +128,7 @@ class Truth:
 def check_match(caller: str, renders: Renders, truth: Truth) -> None:
     """Refuse renders of another number or size than the photos."""
     if renders.colours.shape != truth.photos.shape:
-        raise ValueError(
+        raise InvalidArgument(
             f"{caller}: renders must have the photos' shape {truth.photos.shape}, got {renders.colours.shape}: "
             "render at the photos' size, or resize the photos, before scoring"
         )

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.cameras import Cameras
+from ...core.errors import InvalidArgument
 
 FloatArray = NDArray[np.float64]
 CHUNK = 1 << 14  # points at a time: what fits a processor's cache
@@ -57,7 +58,7 @@ def photo_doubt(
     _check("photo_cameras", photo_cameras, photos=photos, photo_depth=photo_depth)
     for name, value in (("tolerance", tolerance), ("slack", slack)):
         if not 0 <= value < np.inf:
-            raise ValueError(f"photo_doubt: {name} must be finite and >= 0, got {value}")
+            raise InvalidArgument(f"photo_doubt: {name} must be finite and >= 0, got {value}")
     result = np.full(depth.shape, UNSEEN, dtype=np.float32)
     for index in range(len(cameras)):
         known = np.isfinite(depth[index])
@@ -117,8 +118,8 @@ def _check(lens: str, cameras: Cameras, **maps: NDArray[Any]) -> None:
         is_depth = name.endswith("depth")
         wanted = size if is_depth else (*size, 3)
         if values.shape != wanted:
-            raise ValueError(f"photo_doubt: {name} must have shape {wanted} for {lens}, got {values.shape}")
+            raise InvalidArgument(f"photo_doubt: {name} must have shape {wanted} for {lens}, got {values.shape}")
         bad = int((~(values > 0)).sum() if is_depth else (~((values >= -1e-4) & (values <= 1 + 1e-4))).sum())
         if bad:
             rule = "be > 0 (inf for none)" if is_depth else "lie in [0, 1]"
-            raise ValueError(f"photo_doubt: {name} must {rule}, {bad} values do not")
+            raise InvalidArgument(f"photo_doubt: {name} must {rule}, {bad} values do not")

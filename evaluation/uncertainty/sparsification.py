@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.errors import InvalidArgument
+
 FloatArray = NDArray[np.float64]
 REDUCTIONS = ("mae", "rmse", "mse")
 NORMALIZATIONS = ("whole", "largest")
@@ -72,9 +74,9 @@ def sparsify(
         ("normalization", normalization, NORMALIZATIONS),
     ):
         if value not in choices:
-            raise ValueError(f"sparsify: {name} must be one of {', '.join(choices)}, got {value!r}")
+            raise InvalidArgument(f"sparsify: {name} must be one of {', '.join(choices)}, got {value!r}")
     if steps < 2:
-        raise ValueError(f"sparsify: steps must be >= 2, got {steps}")
+        raise InvalidArgument(f"sparsify: steps must be >= 2, got {steps}")
     errors, doubts = _chosen(error, uncertainty, mask)
     powered = errors if reduction == "mae" else errors**2
     left = np.maximum(((1 - np.arange(steps) / steps) * len(errors) + 1e-9).astype(np.int64), 1)
@@ -102,18 +104,20 @@ def _chosen(
     error: NDArray[Any], uncertainty: NDArray[Any], mask: NDArray[np.bool_] | None
 ) -> tuple[FloatArray, FloatArray]:
     if error.shape != uncertainty.shape:
-        raise ValueError(f"sparsify: uncertainty must have the shape of error {error.shape}, got {uncertainty.shape}")
+        raise InvalidArgument(
+            f"sparsify: uncertainty must have the shape of error {error.shape}, got {uncertainty.shape}"
+        )
     chosen = np.ones(error.shape, dtype=np.bool_) if mask is None else mask
     if chosen.dtype != np.bool_ or chosen.shape != error.shape:
-        raise ValueError(f"sparsify: mask must be bool of shape {error.shape}, got {chosen.dtype} {chosen.shape}")
+        raise InvalidArgument(f"sparsify: mask must be bool of shape {error.shape}, got {chosen.dtype} {chosen.shape}")
     if not chosen.any():
-        raise ValueError("sparsify: the mask must hold at least one pixel")
+        raise InvalidArgument("sparsify: the mask must hold at least one pixel")
     errors, doubts = error[chosen].astype(np.float64), uncertainty[chosen].astype(np.float64)
     bad = int((~(np.isfinite(errors) & (errors >= 0))).sum())
     if bad:
-        raise ValueError(f"sparsify: error must be finite and >= 0, {bad} unmasked values are not")
+        raise InvalidArgument(f"sparsify: error must be finite and >= 0, {bad} unmasked values are not")
     if np.isnan(doubts).any():
-        raise ValueError(f"sparsify: {int(np.isnan(doubts).sum())} unmasked uncertainties are NaN")
+        raise InvalidArgument(f"sparsify: {int(np.isnan(doubts).sum())} unmasked uncertainties are NaN")
     return errors, doubts
 
 

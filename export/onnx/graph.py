@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.errors import InvalidArgument
+
 OPSET = 18
 IR_VERSION = 8
 OPERATORS = frozenset(
@@ -66,7 +68,7 @@ class GraphBuilder:
         import onnx.helper
 
         if operator not in self.operators:
-            raise ValueError(f"GraphBuilder: operator {operator} is not among {sorted(self.operators)}")
+            raise InvalidArgument(f"GraphBuilder: operator {operator} is not among {sorted(self.operators)}")
         stem = name or f"{operator.lower()}_{len(self.nodes)}"
         names = [stem] if outputs == 1 else [f"{stem}_{index}" for index in range(outputs)]
         self.nodes.append(onnx.helper.make_node(operator, list(inputs), names, name=stem, **attributes))

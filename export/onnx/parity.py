@@ -20,6 +20,7 @@ from ...core.channels import (
     encode_view_count,
     stack_channels,
 )
+from ...core.errors import InvalidArgument, MissingExtra
 from ...core.frames import RESOLUTION, unit_lattice
 from ...core.manifest import Denoiser, Manifest
 from ...core.occupancy import EMPTY, OCCUPIED, occupancy_from_signed, signed_from_opacity
@@ -89,7 +90,7 @@ def parity_inputs(cubes: int, seed: int, *, channels: Sequence[str] = (SIGNED_OP
     ``channels`` names what the denoiser takes; each optional one is unknown in one cube of four.
     """
     if cubes < 1:
-        raise ValueError(f"parity_inputs: cubes must be >= 1, got {cubes}")
+        raise InvalidArgument(f"parity_inputs: cubes must be >= 1, got {cubes}")
     values = np.empty((cubes, len(channels), *(RESOLUTION,) * 3), np.float32)
     times, edges = np.empty(cubes, np.int64), np.empty(cubes, np.float32)
     for index in range(cubes):
@@ -114,19 +115,21 @@ def check_inputs(inputs: ParityInputs, *, caller: str) -> None:
     """
     count, cube = len(inputs.channels), (RESOLUTION,) * 3
     if count < 1 or inputs.channels.ndim != 5 or inputs.channels.shape[2:] != cube:
-        raise ValueError(f"{caller}: channels must have shape (N, C, 32, 32, 32), N >= 1, got {inputs.channels.shape}")
+        raise InvalidArgument(
+            f"{caller}: channels must have shape (N, C, 32, 32, 32), N >= 1, got {inputs.channels.shape}"
+        )
     dtypes = (inputs.channels.dtype, inputs.timestep.dtype, inputs.edge_fraction.dtype)
     if dtypes != (np.dtype(np.float32), np.dtype(np.int64), np.dtype(np.float32)):
-        raise ValueError(f"{caller}: dtypes must be float32, int64, float32, got {', '.join(map(str, dtypes))}")
+        raise InvalidArgument(f"{caller}: dtypes must be float32, int64, float32, got {', '.join(map(str, dtypes))}")
     if inputs.timestep.shape != (count,) or inputs.edge_fraction.shape != (count,):
         shapes = (inputs.timestep.shape, inputs.edge_fraction.shape)
-        raise ValueError(f"{caller}: timestep and edge_fraction must have shape ({count},), got {shapes}")
+        raise InvalidArgument(f"{caller}: timestep and edge_fraction must have shape ({count},), got {shapes}")
     if not (np.abs(inputs.channels) <= 1.0).all():
-        raise ValueError(f"{caller}: channels must be finite and in [-1, 1]")
+        raise InvalidArgument(f"{caller}: channels must be finite and in [-1, 1]")
     if not ((inputs.timestep >= 0) & (inputs.timestep < TIMESTEPS)).all():
-        raise ValueError(f"{caller}: timestep must lie in [0, {TIMESTEPS})")
+        raise InvalidArgument(f"{caller}: timestep must lie in [0, {TIMESTEPS})")
     if not ((inputs.edge_fraction > 0) & np.isfinite(inputs.edge_fraction)).all():
-        raise ValueError(f"{caller}: edge_fraction must be finite and > 0")
+        raise InvalidArgument(f"{caller}: edge_fraction must be finite and > 0")
 
 
 def session_denoiser(body: bytes, manifest: Manifest) -> Denoiser:
@@ -200,13 +203,13 @@ def verify(
     try:
         from ...prior.checkpoint import load_model
     except ImportError as error:
-        raise ImportError(f"verify: needs {error.name}: pip install unghost[export]") from None
+        raise MissingExtra(f"verify: needs {error.name}: pip install unghost[export]") from None
     from ..runtime import OnnxDenoiser
 
     exported = OnnxDenoiser(onnx_path, threads=threads, providers=["CPUExecutionProvider"])
     reference = load_model(checkpoint_path)
     if exported.manifest.channels != reference.manifest.channels:
-        raise ValueError(
+        raise InvalidArgument(
             f"verify: {onnx_path} takes {exported.manifest.channels}, {checkpoint_path} {reference.manifest.channels}"
         )
     inputs = parity_inputs(cubes, seed, channels=reference.manifest.channels)

@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from ...core.errors import InvalidArgument, MissingExtra
 from ...core.manifest import Manifest
 from ...core.schedule import TIMESTEPS
 from ..container import PRECISIONS, body_of, precision_of, unseal, write_sealed
@@ -51,7 +52,7 @@ def half_precision_body(body: bytes) -> bytes:
             continue
         worst = float(np.abs(values).max())
         if not worst <= float(np.finfo(np.float16).max):
-            raise ValueError(f"half_precision_body: {item.name} holds {worst:.3g}, float16 ends at 65504")
+            raise InvalidArgument(f"half_precision_body: {item.name} holds {worst:.3g}, float16 ends at 65504")
         name = item.name
         item.CopyFrom(onnx.numpy_helper.from_array(values.astype(np.float16), f"{name}_half"))
         casts.append(onnx.helper.make_node("Cast", [f"{name}_half"], [name], name=f"{name}_cast", to=1))
@@ -138,10 +139,12 @@ def int8_body(body: bytes, calibration: ParityInputs) -> bytes:
     model = onnx.ModelProto.FromString(body)
     chosen = _quantised_nodes(model)
     if not chosen:
-        raise ValueError("int8_body: the model has no convolution to quantise (the last one stays in float32)")
+        raise InvalidArgument("int8_body: the model has no convolution to quantise (the last one stays in float32)")
     names = {value.name for value in model.graph.input}
     if names != set(vars(calibration)):
-        raise ValueError(f"int8_body: the model's inputs are {sorted(names)}, expected {sorted(vars(calibration))}")
+        raise InvalidArgument(
+            f"int8_body: the model's inputs are {sorted(names)}, expected {sorted(vars(calibration))}"
+        )
     onnx.helper.set_model_props(model, dict([PRE_PROCESSED]))
     with tempfile.TemporaryDirectory(prefix="unghost.") as folder:
         written = Path(folder) / "int8.onnx"
@@ -172,13 +175,13 @@ def body_in(precision: str, body: bytes, calibration: ParityInputs | None) -> by
         ValueError: an unknown precision, or int8 without calibration inputs.
     """
     if precision not in PRECISIONS:
-        raise ValueError(f"body_in: precision must be one of {', '.join(PRECISIONS)}, got {precision!r}")
+        raise InvalidArgument(f"body_in: precision must be one of {', '.join(PRECISIONS)}, got {precision!r}")
     if precision == "fp32":
         return body
     if precision == "fp16":
         return half_precision_body(body)
     if calibration is None:
-        raise ValueError("body_in: int8 needs calibration inputs")
+        raise InvalidArgument("body_in: int8 needs calibration inputs")
     return int8_body(body, calibration)
 
 
@@ -219,12 +222,12 @@ def convert_onnx(
     data = read_file(onnx_path)
     manifest = unseal(data, origin=str(onnx_path))
     if precision_of(manifest) != "fp32":
-        raise ValueError(f"convert_onnx: {onnx_path} is {precision_of(manifest)} already, an fp32 file is needed")
+        raise InvalidArgument(f"convert_onnx: {onnx_path} is {precision_of(manifest)} already, an fp32 file is needed")
     body = body_of(data, manifest)
     try:
         converted = body_in(precision, body, calibration)
     except ImportError as error:
-        raise ImportError(f"convert_onnx: needs {error.name}: pip install unghost[export]") from None
+        raise MissingExtra(f"convert_onnx: needs {error.name}: pip install unghost[export]") from None
     facts: dict[str, Any] = {"fp32_sha256": manifest.body_sha256}
     if precision == "int8" and calibration is not None:
         facts |= {"calibration": source, "calibration_cubes": len(calibration.channels)}
@@ -233,7 +236,7 @@ def convert_onnx(
         inputs = parity_inputs(verify_cubes, 0, channels=manifest.channels)
         report = compare(session_denoiser(converted, stated), session_denoiser(body, manifest), inputs)
         if not report["passed"]:
-            raise ValueError(f"convert_onnx: {precision} is too far from fp32: {report}")
+            raise InvalidArgument(f"convert_onnx: {precision} is too far from fp32: {report}")
     write_sealed(out_path, converted, stated)
     return read_manifest(out_path)
 
@@ -265,9 +268,9 @@ def export_precisions(
 
     unknown = [name for name in precisions if name not in PRECISIONS]
     if unknown or not precisions:
-        raise ValueError(f"export_precisions: precisions must be among {', '.join(PRECISIONS)}, got {precisions}")
+        raise InvalidArgument(f"export_precisions: precisions must be among {', '.join(PRECISIONS)}, got {precisions}")
     if "int8" in precisions and calibration is None:
-        raise ValueError("export_precisions: int8 needs calibration inputs")
+        raise InvalidArgument("export_precisions: int8 needs calibration inputs")
     origin, target = Path(checkpoint_path), Path(folder)
     files = {
         name: target / (f"{origin.stem}.onnx" if name == "fp32" else f"{origin.stem}.{name}.onnx")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ...core.errors import InvalidArgument, MissingExtra
 from ...core.manifest import Manifest
 from ..container import write_sealed
 
@@ -34,7 +35,7 @@ def export_onnx(checkpoint_path: str | Path, out_path: str | Path, *, verify_cub
         from ...prior.checkpoint import load_model
         from .diffusion_graph import denoiser_model, export_tolerance
     except ImportError as error:
-        raise ImportError(f"export_onnx: needs {error.name}: pip install unghost[export]") from None
+        raise MissingExtra(f"export_onnx: needs {error.name}: pip install unghost[export]") from None
     denoiser = load_model(checkpoint_path)
     model = denoiser_model(denoiser.network)
     onnx.checker.check_model(model, full_check=True)
@@ -46,7 +47,9 @@ def export_onnx(checkpoint_path: str | Path, out_path: str | Path, *, verify_cub
         report = compare(session_denoiser(body, denoiser.manifest), denoiser, inputs)
         allowed = export_tolerance(denoiser.network)
         if not report["max_error"] <= allowed:
-            raise ValueError(f"export_onnx: ONNX and torch differ by {report['max_error']:.2e}, more than {allowed:g}")
+            raise InvalidArgument(
+                f"export_onnx: ONNX and torch differ by {report['max_error']:.2e}, more than {allowed:g}"
+            )
     write_sealed(out_path, body, denoiser.manifest)
     from ..runtime import read_manifest
 

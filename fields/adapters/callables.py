@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...core.aabb import as_aabb
 from ...core.arrays import Array, is_tensor, namespace, to_numpy
+from ...core.errors import InvalidArgument, InvalidType
 from ...core.occupancy import check_density_shape
 
 DensityFn = Callable[[Array], Array]
@@ -38,15 +39,15 @@ def numpy_density_fn(
         (2, 2, 1)
     """
     if not callable(function):
-        raise TypeError(f"numpy_density_fn: function must be callable, got {type(function).__name__}")
+        raise InvalidType(f"numpy_density_fn: function must be callable, got {type(function).__name__}")
     if chunk < 1:
-        raise ValueError(f"numpy_density_fn: chunk must be >= 1, got {chunk}")
+        raise InvalidArgument(f"numpy_density_fn: chunk must be >= 1, got {chunk}")
     box = None if aabb is None else as_aabb(aabb, caller="numpy_density_fn")
 
     def density_fn(positions: Array) -> Array:
         points = np.asarray(to_numpy(positions), dtype=np.float64)
         if points.shape[-1:] != (3,):
-            raise ValueError(f"numpy_density_fn: positions must have shape (..., 3), got {points.shape}")
+            raise InvalidArgument(f"numpy_density_fn: positions must have shape (..., 3), got {points.shape}")
         flat = points.reshape(-1, 3)
         asked = np.arange(len(flat)) if box is None else np.flatnonzero(((flat >= box[0]) & (flat <= box[1])).all(1))
         density = np.zeros(len(flat), dtype=np.float32)
@@ -81,9 +82,9 @@ def occupancy_density_fn(occupancy_fn: Callable[[Array], Array], *, pitch: float
         [0.0, 6.93, 69.08]
     """
     if not 0.0 < pitch < np.inf:
-        raise ValueError(f"occupancy_density_fn: pitch must be finite and > 0, got {pitch}")
+        raise InvalidArgument(f"occupancy_density_fn: pitch must be finite and > 0, got {pitch}")
     if not 0.0 < most < 1.0:
-        raise ValueError(f"occupancy_density_fn: most must lie in (0, 1), got {most}")
+        raise InvalidArgument(f"occupancy_density_fn: most must lie in (0, 1), got {most}")
 
     def density_fn(positions: Array) -> Array:
         share = occupancy_fn(positions)
@@ -93,7 +94,7 @@ def occupancy_density_fn(occupancy_fn: Callable[[Array], Array], *, pitch: float
         elif not share.is_floating_point():
             share = share.float()
         if not bool(((share >= 0) & (share <= 1)).all()):
-            raise ValueError("occupancy_density_fn: occupancy_fn must return probabilities in [0, 1]")
+            raise InvalidArgument("occupancy_density_fn: occupancy_fn must return probabilities in [0, 1]")
         return -xp.log1p(-xp.clip(share, None, most)) / pitch
 
     return density_fn
@@ -117,11 +118,13 @@ def transformed_density_fn(density_fn: DensityFn, transform: ArrayLike) -> Densi
     """
     matrix = np.asarray(to_numpy(transform), dtype=np.float64)
     if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
-        raise ValueError(f"transformed_density_fn: transform must be a finite (3, 4) or (4, 4), got {matrix.shape}")
+        raise InvalidArgument(
+            f"transformed_density_fn: transform must be a finite (3, 4) or (4, 4), got {matrix.shape}"
+        )
     turn, shift = matrix[:3, :3], matrix[:3, 3]
     factor = float(np.cbrt(abs(np.linalg.det(turn))))
     if factor == 0 or not np.allclose(turn @ turn.T, factor**2 * np.eye(3), rtol=0, atol=1e-5 * factor**2):
-        raise ValueError(
+        raise InvalidArgument(
             f"transformed_density_fn: transform must be a rotation times one factor, got {turn.round(6).tolist()}"
         )
 

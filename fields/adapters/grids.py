@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...core.aabb import as_aabb
+from ...core.errors import InvalidArgument, InvalidFile, MissingFile
 from ...core.interpolate import interpolate_grid
 from ...core.io import write_npz
 from ...core.lattice import cell_centers as cell_centers
@@ -37,7 +38,7 @@ def grid_density_fn(density: NDArray[Any], aabb: ArrayLike) -> DensityFn:
     """
     values = np.ascontiguousarray(density, dtype=np.float32)
     if values.ndim != 3 or 0 in values.shape:
-        raise ValueError(f"grid_density_fn: density must have shape (X, Y, Z), got {values.shape}")
+        raise InvalidArgument(f"grid_density_fn: density must have shape (X, Y, Z), got {values.shape}")
     box = as_aabb(aabb, caller="grid_density_fn")
     shape = np.array(values.shape)
 
@@ -73,17 +74,17 @@ def load_grid(path: str | Path) -> tuple[NDArray[np.float32], NDArray[np.float64
         with source.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in ("density", "aabb") if name in archive}
     except FileNotFoundError:
-        raise FileNotFoundError(f"load_grid: no file {source}") from None
+        raise MissingFile(f"load_grid: no file {source}") from None
     except (OSError, ValueError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as error:
-        raise ValueError(f"load_grid: {source} is not an .npz file, or is truncated ({error})") from None
+        raise InvalidFile(f"load_grid: {source} is not an .npz file, or is truncated ({error})") from None
     missing = sorted({"density", "aabb"} - set(arrays))
     if missing:
-        raise ValueError(f"load_grid: {source} must hold the arrays density and aabb, lacks {', '.join(missing)}")
+        raise InvalidFile(f"load_grid: {source} must hold the arrays density and aabb, lacks {', '.join(missing)}")
     density = arrays["density"]
     if density.ndim == 4 and density.shape[-1] == 1:
         density = density[..., 0]
     if density.ndim != 3 or 0 in density.shape:
-        raise ValueError(f"load_grid: density in {source} must have shape (X, Y, Z), got {density.shape}")
+        raise InvalidFile(f"load_grid: density in {source} must have shape (X, Y, Z), got {density.shape}")
     return density.astype(np.float32), as_aabb(arrays["aabb"], caller=f"load_grid: {source}")
 
 

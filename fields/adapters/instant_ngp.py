@@ -22,6 +22,7 @@ from typing import Any, BinaryIO, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ...core.errors import InvalidArgument, InvalidFile, MissingFile
 from .msgpack_stream import MsgpackError, read_msgpack
 
 CELLS = 128
@@ -39,7 +40,7 @@ def morton_index(resolution: int = CELLS) -> NDArray[np.int64]:
         [0, 4, 2, 6, 1, 5, 3, 7]
     """
     if resolution < 1 or resolution & (resolution - 1):
-        raise ValueError(f"morton_index: resolution must be a power of two, got {resolution}")
+        raise InvalidArgument(f"morton_index: resolution must be a power of two, got {resolution}")
     axis = np.arange(resolution, dtype=np.int64)
     spread = np.zeros_like(axis)
     for bit in range(resolution.bit_length()):
@@ -80,7 +81,7 @@ class InstantNgpGrid:
         """
         points = np.asarray(positions, dtype=np.float64)
         if points.shape[-1:] != (3,):
-            raise ValueError(f"InstantNgpGrid.density_fn: positions must have shape (..., 3), got {points.shape}")
+            raise InvalidArgument(f"InstantNgpGrid.density_fn: positions must have shape (..., 3), got {points.shape}")
         flat = points.reshape(-1, 3)
         inside = ((flat >= self.aabb[0]) & (flat <= self.aabb[1])).all(axis=1)
         local = np.where(inside[:, None], flat, 0.5) - 0.5
@@ -146,7 +147,7 @@ def load_instant_ngp(path: str | Path) -> InstantNgpGrid:
     """
     source = Path(path)
     if not source.is_file():
-        raise FileNotFoundError(f"load_instant_ngp: no file {source}")
+        raise MissingFile(f"load_instant_ngp: no file {source}")
     try:
         with source.open("rb") as raw:
             packed = raw.read(2) == b"\x1f\x8b"
@@ -155,7 +156,7 @@ def load_instant_ngp(path: str | Path) -> InstantNgpGrid:
             content = read_msgpack(cast(BinaryIO, _Limited(cast(BinaryIO, stream), MOST_BYTES)), wanted=_wanted)
         return _grid(content)
     except (MsgpackError, EOFError, OSError, zlib.error) as error:
-        raise ValueError(
+        raise InvalidFile(
             f"load_instant_ngp: {source} is not a snapshot of instant-ngp, or is cut short: {error}"
         ) from None
 

@@ -11,6 +11,8 @@ import struct
 from collections.abc import Callable
 from typing import Any, BinaryIO
 
+from ...core.errors import InvalidFile
+
 MOST_DEPTH = 32
 MOST_ITEMS = 1 << 20  # values of all kinds, keys included
 MOST_TEXT = 1 << 24  # bytes, of all texts together
@@ -39,7 +41,7 @@ _ARRAYS = {0xDC: ">H", 0xDD: ">I"}
 _MAPS = {0xDE: ">H", 0xDF: ">I"}
 
 
-class MsgpackError(ValueError):
+class MsgpackError(InvalidFile):
     """Not MessagePack, cut short, or larger than the limits of this module."""
 
 

@@ -17,6 +17,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from ...core.errors import InvalidArgument, InvalidFile, MissingFile
+
 MOST_BYTES = 1 << 28  # of a checkpoint, unpacked; the usual one has 13 million
 CHUNK = 1 << 15  # positions that pass through the network at once
 WORLD_HALF_SIDE = 1.5  # the box in which the synthetic scenes of these programs lie
@@ -132,17 +134,17 @@ def _bands(count: int, log_sampling: bool) -> Tensor:
 def _trunk(state: Mapping[str, Tensor], first: str) -> list[tuple[str, bool]]:
     """The layers after the first, and whether each one is given the encoding again. Checks every shape."""
     if f"{first}.weight" not in state:
-        raise ValueError("it has neither layer1 nor pts_linears.0")
+        raise InvalidFile("it has neither layer1 nor pts_linears.0")
     hidden, channels = _shape(state, first)
     if channels % 6 not in (0, 3) or channels < 3:
-        raise ValueError(f"{first} reads {channels} channels, which is no encoding of a position")
+        raise InvalidFile(f"{first} reads {channels} channels, which is no encoding of a position")
     stem, start = ("layers_xyz", 0) if first == "layer1" else ("pts_linears", 1)
     layers = []
     index = start
     while f"{stem}.{index}.weight" in state:
         out, read = _shape(state, f"{stem}.{index}")
         if out != hidden or read not in (hidden, hidden + channels):
-            raise ValueError(f"{stem}.{index} is {(out, read)} after a layer of {hidden} and {channels} channels")
+            raise InvalidFile(f"{stem}.{index} is {(out, read)} after a layer of {hidden} and {channels} channels")
         layers.append((f"{stem}.{index}", read != hidden))
         index += 1
     _check_heads(state, hidden, "fc" if first == "layer1" else "linear")
@@ -157,21 +159,21 @@ def _check_heads(state: Mapping[str, Tensor], hidden: int, kind: str) -> None:
     )
     if f"{alpha}.weight" not in state:
         if _shape(state, out) not in ((4, hidden), (5, hidden)):
-            raise ValueError(f"{out} is {_shape(state, out)} after a layer of {hidden}")
+            raise InvalidFile(f"{out} is {_shape(state, out)} after a layer of {hidden}")
         return
     width, read = _shape(state, view)
     rules = {alpha: (1, hidden), feature: (hidden, hidden), rgb: (3, width)}
     for name, due in rules.items():
         if _shape(state, name) != due:
-            raise ValueError(f"{name} is {_shape(state, name)}, must be {due}")
+            raise InvalidFile(f"{name} is {_shape(state, name)}, must be {due}")
     if read < hidden or (read - hidden) % 6 not in (0, 3):
-        raise ValueError(f"{view} reads {read - hidden} channels of a direction")
+        raise InvalidFile(f"{view} reads {read - hidden} channels of a direction")
 
 
 def _shape(state: Mapping[str, Tensor], name: str) -> tuple[int, int]:
     weight, bias = state.get(f"{name}.weight"), state.get(f"{name}.bias")
     if weight is None or bias is None or weight.ndim != 2 or bias.shape != weight.shape[:1] or 0 in weight.shape:
-        raise ValueError(f"layer {name} is missing or has no (out, in) weight with its (out,) bias")
+        raise InvalidFile(f"layer {name} is missing or has no (out, in) weight with its (out,) bias")
     return int(weight.shape[0]), int(weight.shape[1])
 
 
@@ -182,22 +184,22 @@ def _state(path: Path, network: str) -> dict[str, Tensor]:
         with zipfile.ZipFile(path) as archive:
             unpacked = max(unpacked, sum(entry.file_size for entry in archive.infolist()))
     if unpacked > MOST_BYTES:
-        raise ValueError(f"it has {unpacked} bytes, more than {MOST_BYTES}")
+        raise InvalidFile(f"it has {unpacked} bytes, more than {MOST_BYTES}")
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises half a dozen kinds for a file that is not its own
-        raise ValueError(f"torch cannot read it ({str(error).splitlines()[0] if str(error) else error!r})") from None
+        raise InvalidFile(f"torch cannot read it ({str(error).splitlines()[0] if str(error) else error!r})") from None
     names = _STATES[network]
     found = content if isinstance(content, Mapping) else {}
     state = next((found[name] for name in names if found.get(name) is not None), None)
     if not isinstance(state, Mapping) or not state:
-        raise ValueError(f"it holds no {' or '.join(names)}")
+        raise InvalidFile(f"it holds no {' or '.join(names)}")
     tensors = {str(key).removeprefix("module."): value for key, value in state.items()}
     for key, value in tensors.items():
         if not (isinstance(value, Tensor) and value.is_floating_point() and key.endswith((".weight", ".bias"))):
-            raise ValueError(f"{key} of {names[0]} is not a layer's weight or bias")
+            raise InvalidFile(f"{key} of {names[0]} is not a layer's weight or bias")
         if not bool(torch.isfinite(value).all()):
-            raise ValueError(f"{key} holds values that are not finite")
+            raise InvalidFile(f"{key} holds values that are not finite")
     return tensors
 
 
@@ -234,13 +236,13 @@ def load_nerf_pytorch(
     """
     source = Path(path)
     if network not in _STATES:
-        raise ValueError(f"load_nerf_pytorch: network must be one of {', '.join(_STATES)}, got {network!r}")
+        raise InvalidArgument(f"load_nerf_pytorch: network must be one of {', '.join(_STATES)}, got {network!r}")
     if not source.is_file():
-        raise FileNotFoundError(f"load_nerf_pytorch: no file {source}")
+        raise MissingFile(f"load_nerf_pytorch: no file {source}")
     if ndc is None:
         no_ndc = _configured(source, "no_ndc")
         if no_ndc is None:
-            raise ValueError(
+            raise InvalidArgument(
                 f"load_nerf_pytorch: no config.yml or config.txt beside {source} says no_ndc: pass ndc=True if it was "
                 "trained in normalised device coordinates (forward-facing captures), else ndc=False"
             )
@@ -249,7 +251,7 @@ def load_nerf_pytorch(
         state = _state(source, network)
         return NerfPytorchField(state, ndc=ndc, log_sampling=_configured(source, "log_sampling_xyz") is not False)
     except ValueError as error:
-        raise ValueError(f"load_nerf_pytorch: {source} is not a checkpoint of nerf-pytorch: {error}") from None
+        raise InvalidFile(f"load_nerf_pytorch: {source} is not a checkpoint of nerf-pytorch: {error}") from None
 
 
 def ndc_from_world(
@@ -273,5 +275,5 @@ def ndc_from_world(
     points = np.asarray(positions, dtype=np.float64)
     x, y, z = np.moveaxis(points, -1, 0)
     if not (z < 0).all():
-        raise ValueError(f"ndc_from_world: positions must have z < 0 (before the camera), got z = {np.max(z)}")
+        raise InvalidArgument(f"ndc_from_world: positions must have z < 0 (before the camera), got z = {np.max(z)}")
     return np.stack([-2.0 * focal / width * x / z, -2.0 * focal / height * y / z, 1.0 + 2.0 * near / z], axis=-1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from ...core.arrays import Array, namespace
+from ...core.errors import InvalidArgument
 
 DensityFn = Callable[[Array], Array]
 
@@ -85,9 +86,11 @@ def sdf_density_fn(
         array([25.])
     """
     if (beta is None) == (sharpness is None):
-        raise ValueError(f"sdf_density_fn: pass either beta or sharpness, got beta={beta!r}, sharpness={sharpness!r}")
+        raise InvalidArgument(
+            f"sdf_density_fn: pass either beta or sharpness, got beta={beta!r}, sharpness={sharpness!r}"
+        )
     if sharpness is not None and alpha is not None:
-        raise ValueError(f"sdf_density_fn: alpha belongs to beta, got alpha={alpha!r} with sharpness")
+        raise InvalidArgument(f"sdf_density_fn: alpha belongs to beta, got alpha={alpha!r} with sharpness")
     _positive("sdf_density_fn", beta=beta, alpha=alpha, sharpness=sharpness)
 
     def density_fn(positions: Array) -> Array:
@@ -103,4 +106,4 @@ def sdf_density_fn(
 def _positive(caller: str, **values: float | None) -> None:
     for name, value in values.items():
         if value is not None and not 0.0 < value < float("inf"):
-            raise ValueError(f"{caller}: {name} must be finite and > 0, got {value}")
+            raise InvalidArgument(f"{caller}: {name} must be finite and > 0, got {value}")

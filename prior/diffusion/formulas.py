@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ...core.errors import InvalidArgument, InvalidType
 from ...core.occupancy import EMPTY, OCCUPIED, SURFACE_LABEL, signed_from_occupancy
 from ...core.schedule import alphas_cumprod
 
@@ -35,11 +36,11 @@ def kept_share(timestep: Tensor, like: Tensor) -> Tensor:
         [1.0, 0.0]
     """
     if timestep.is_floating_point() or timestep.dtype == torch.bool:
-        raise TypeError(f"kept_share: timestep must be an integer, got dtype {timestep.dtype}")
+        raise InvalidType(f"kept_share: timestep must be an integer, got dtype {timestep.dtype}")
     if tuple(timestep.shape) != (len(like),):
-        raise ValueError(f"kept_share: timestep must have shape ({len(like)},), got {tuple(timestep.shape)}")
+        raise InvalidArgument(f"kept_share: timestep must have shape ({len(like)},), got {tuple(timestep.shape)}")
     if timestep.numel() and not (int(timestep.min()) >= -1 and int(timestep.max()) < len(_KEPT) - 1):
-        raise ValueError(f"kept_share: timestep must lie in [-1, 1000), got {timestep.min()} .. {timestep.max()}")
+        raise InvalidArgument(f"kept_share: timestep must lie in [-1, 1000), got {timestep.min()} .. {timestep.max()}")
     table = torch.from_numpy(_KEPT)
     rows = table[timestep.cpu().long()].to(like.device)
     return rows.view(-1, *([1] * (like.ndim - 1)))
@@ -116,7 +117,7 @@ def epsilon_from_x0(xt: Tensor, timestep: Tensor, x0: Tensor) -> Tensor:
 
 def _check_order(previous: Tensor, timestep: Tensor, caller: str) -> None:
     if bool((previous >= timestep).any()) or bool((timestep < 0).any()):
-        raise ValueError(f"{caller}: previous must be < timestep, which must be >= 0")
+        raise InvalidArgument(f"{caller}: previous must be < timestep, which must be >= 0")
 
 
 def bernoulli_posterior(xt: Tensor, x0_pred: Tensor, timestep: Tensor, previous: Tensor) -> Tensor:
@@ -167,6 +168,6 @@ def clean_cubes(labels: Tensor) -> Tensor:
 def _same_shape(caller: str, **tensors: Tensor) -> None:
     (first, one), (second, other) = tensors.items()
     if one.shape != other.shape:
-        raise ValueError(
+        raise InvalidArgument(
             f"{caller}: {second} must have the shape of {first} {tuple(one.shape)}, got {tuple(other.shape)}"
         )

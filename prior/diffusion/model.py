@@ -27,6 +27,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ...core.config import from_dict, to_dict
+from ...core.errors import InvalidArgument
 from ...core.occupancy import EMPTY, OCCUPIED
 from ...core.schedule import flip_log_odds
 from ..networks.restoration import NetworkConfig, RestorationNet
@@ -62,16 +63,18 @@ class DiffusionConfig:
 
     def __post_init__(self) -> None:
         if self.objective not in OBJECTIVES:
-            raise ValueError(f"DiffusionConfig: objective must be one of {OBJECTIVES}, got {self.objective!r}")
+            raise InvalidArgument(f"DiffusionConfig: objective must be one of {OBJECTIVES}, got {self.objective!r}")
         if self.kind != KIND:
-            raise ValueError(f"DiffusionConfig: kind must be {KIND!r}, got {self.kind!r}")
+            raise InvalidArgument(f"DiffusionConfig: kind must be {KIND!r}, got {self.kind!r}")
         if self.network.channels != NetworkConfig().channels:
-            raise ValueError(f"DiffusionConfig: network must take signed opacity alone, got {self.network.channels}")
+            raise InvalidArgument(
+                f"DiffusionConfig: network must take signed opacity alone, got {self.network.channels}"
+            )
         if self.shortcut is None:
             compact = isinstance(self.network, NetworkConfig)
             object.__setattr__(self, "shortcut", self.objective == "epsilon" and compact)
         if self.shortcut and self.objective != "epsilon":
-            raise ValueError(f"DiffusionConfig: shortcut is of objective 'epsilon', got {self.objective!r}")
+            raise InvalidArgument(f"DiffusionConfig: shortcut is of objective 'epsilon', got {self.objective!r}")
 
     @property
     def channels(self) -> Any:
@@ -90,7 +93,7 @@ class DiffusionConfig:
 
 def _backbone(values: Any) -> NetworkConfig | UNetConfig:
     if not isinstance(values, Mapping):
-        raise ValueError("DiffusionConfig: network must be a table")
+        raise InvalidArgument("DiffusionConfig: network must be a table")
     return (UNetConfig if values.get("kind") == UNetConfig.kind else NetworkConfig).from_dict(values)
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ...core.errors import InvalidArgument
 from ..checkpoint import TorchDenoiser
 from .model import DiffusionNet
 
@@ -40,7 +41,7 @@ class NoisedDenoiser:
 
     def __init__(self, denoiser: TorchDenoiser, generator: torch.Generator) -> None:
         if not isinstance(denoiser.network, DiffusionNet):
-            raise ValueError(
+            raise InvalidArgument(
                 f"NoisedDenoiser: denoiser must be of family 'diffusion', got {denoiser.manifest.family!r}"
             )
         self.denoiser = denoiser

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ...core.errors import InvalidArgument
 from ...core.frames import RESOLUTION
 from ...core.occupancy import signed_from_occupancy
 from ...core.schedule import TIMESTEPS, strided_timesteps
@@ -69,7 +70,7 @@ def sample_gaussian(
     """
     _check_batch("sample_gaussian", shape, edge_fraction, generators)
     if not 0.0 <= eta <= 1.0:
-        raise ValueError(f"sample_gaussian: eta must lie in [0, 1], got {eta}")
+        raise InvalidArgument(f"sample_gaussian: eta must lie in [0, 1], got {eta}")
     xt = x0 = _drawn(torch.randn, shape, generators)
     for step, following in _rungs(steps):
         time, previous = _at(step, xt), _at(following, xt)
@@ -174,14 +175,14 @@ def sample_cubes(
         torch.Size([1, 1, 32, 32, 32])
     """
     if count < 1 or batch_size < 1:
-        raise ValueError(f"sample_cubes: count and batch_size must be >= 1, got {count} and {batch_size}")
+        raise InvalidArgument(f"sample_cubes: count and batch_size must be >= 1, got {count} and {batch_size}")
     if not 0.0 < edge_fraction < float("inf"):
-        raise ValueError(f"sample_cubes: edge_fraction must be finite and > 0, got {edge_fraction}")
+        raise InvalidArgument(f"sample_cubes: edge_fraction must be finite and > 0, got {edge_fraction}")
     if not 1 <= steps <= TIMESTEPS:
-        raise ValueError(f"sample_cubes: steps must lie in [1, {TIMESTEPS}], got {steps}")
+        raise InvalidArgument(f"sample_cubes: steps must lie in [1, {TIMESTEPS}], got {steps}")
     flips = network.config.objective == "bernoulli"
     if flips and eta != 1.0:
-        raise ValueError(f"sample_cubes: eta must be 1 for objective 'bernoulli', got {eta}")
+        raise InvalidArgument(f"sample_cubes: eta must be 1 for objective 'bernoulli', got {eta}")
     device = next(network.parameters()).device
     parts = []
     for first in range(0, count, batch_size):
@@ -210,10 +211,10 @@ def _check_batch(
     caller: str, shape: tuple[int, ...], edge_fraction: Tensor, generators: Sequence[torch.Generator]
 ) -> None:
     if not shape or shape[0] < 1:
-        raise ValueError(f"{caller}: shape must start with one sample or more, got {shape}")
+        raise InvalidArgument(f"{caller}: shape must start with one sample or more, got {shape}")
     if tuple(edge_fraction.shape) != tuple(shape[:1]):
-        raise ValueError(
+        raise InvalidArgument(
             f"{caller}: edge_fraction must have shape {tuple(shape[:1])}, got {tuple(edge_fraction.shape)}"
         )
     if len(generators) != shape[0]:
-        raise ValueError(f"{caller}: generators must be one for each of {shape[0]} samples, got {len(generators)}")
+        raise InvalidArgument(f"{caller}: generators must be one for each of {shape[0]} samples, got {len(generators)}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, TypeAlias
 
+from ...core.errors import InvalidArgument
 from ..diffusion.model import KIND as DIFFUSION
 from ..diffusion.model import DiffusionConfig, DiffusionNet
 from .restoration import NetworkConfig, RestorationNet, gflop
@@ -32,12 +33,12 @@ def config_from_dict(values: Mapping[str, Any]) -> AnyConfig:
         True
     """
     if not isinstance(values, Mapping):
-        raise ValueError(f"config_from_dict: a network must be a table of keys and values, got {values!r:.80}")
+        raise InvalidArgument(f"config_from_dict: a network must be a table of keys and values, got {values!r:.80}")
     kind = values.get("kind")
     if kind is None:
         return NetworkConfig.from_dict(values)
     if kind not in _TAGGED:
-        raise ValueError(f"config_from_dict: kind must be one of {sorted(_TAGGED)} or absent, got {kind!r}")
+        raise InvalidArgument(f"config_from_dict: kind must be one of {sorted(_TAGGED)} or absent, got {kind!r}")
     return _TAGGED[kind].from_dict(values)
 
 
@@ -54,7 +55,7 @@ def backbone_from_dict(values: Mapping[str, Any]) -> BackboneConfig:
     """
     config = config_from_dict(values)
     if isinstance(config, DiffusionConfig):
-        raise ValueError("backbone_from_dict: kind must name a backbone; the diffusion is chosen by the objective")
+        raise InvalidArgument("backbone_from_dict: kind must name a backbone; the diffusion is chosen by the objective")
     return config
 
 

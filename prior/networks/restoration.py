@@ -22,6 +22,7 @@ from torch.nn import functional
 
 from ...core.channels import SIGNED_OPACITY, SURROUNDINGS, check_channels
 from ...core.config import from_dict, to_dict
+from ...core.errors import InvalidArgument
 from ...core.frames import RESOLUTION
 from ...core.occupancy import opacity_from_signed
 from ...core.schedule import TIMESTEPS
@@ -59,11 +60,11 @@ class NetworkConfig:
         object.__setattr__(self, "widths", tuple(self.widths))
         object.__setattr__(self, "blocks", tuple(self.blocks))
         if len(self.widths) != 3 or any(width < 8 or width % 8 for width in self.widths):
-            raise ValueError(f"NetworkConfig: widths must be three multiples of 8, got {self.widths}")
+            raise InvalidArgument(f"NetworkConfig: widths must be three multiples of 8, got {self.widths}")
         if len(self.blocks) != 3 or any(count < 0 for count in self.blocks) or not sum(self.blocks):
-            raise ValueError(f"NetworkConfig: blocks must be three counts >= 0, not all 0, got {self.blocks}")
+            raise InvalidArgument(f"NetworkConfig: blocks must be three counts >= 0, not all 0, got {self.blocks}")
         if self.condition_width < 1:
-            raise ValueError(f"NetworkConfig: condition_width must be >= 1, got {self.condition_width}")
+            raise InvalidArgument(f"NetworkConfig: condition_width must be >= 1, got {self.condition_width}")
 
     @property
     def aligned(self) -> tuple[int, ...]:
@@ -271,13 +272,13 @@ def _check_shapes(channels: Tensor, timestep: Tensor, edge_fraction: Tensor, exp
     count = len(channels)
     shape = (count, expected, *(RESOLUTION,) * 3)
     if tuple(channels.shape) != shape:
-        raise ValueError(
+        raise InvalidArgument(
             f"RestorationNet: channels must have shape (N, {expected}, {RESOLUTION}, {RESOLUTION}, {RESOLUTION}), "
             f"got {tuple(channels.shape)}"
         )
     for name, value in (("timestep", timestep), ("edge_fraction", edge_fraction)):
         if tuple(value.shape) != (count,):
-            raise ValueError(f"RestorationNet: {name} must have shape ({count},), got {tuple(value.shape)}")
+            raise InvalidArgument(f"RestorationNet: {name} must have shape ({count},), got {tuple(value.shape)}")
 
 
 def parameter_count(network: nn.Module) -> int:

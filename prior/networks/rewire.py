@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from ...core.channels import SURROUNDINGS, UNKNOWN
+from ...core.errors import InvalidArgument
 from .restoration import RestorationNet
 
 BLOCK = 8  # input features of the stem per aligned channel: space-to-depth
@@ -52,7 +53,7 @@ def rewire(old: nn.Module, new: nn.Module) -> None:
     """
     if not (isinstance(old, RestorationNet) and isinstance(new, RestorationNet) and can_rewire(old, new)):
         told = [getattr(network, "config", type(network).__name__) for network in (old, new)]
-        raise ValueError(f"rewire: {told[1]} is not {told[0]} with other channels (surroundings must stay)")
+        raise InvalidArgument(f"rewire: {told[1]} is not {told[0]} with other channels (surroundings must stay)")
     given, state = old.state_dict(), new.state_dict()
     for name, value in state.items():
         if name == "stem.weight":

@@ -24,6 +24,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ...core.config import from_dict, to_dict
+from ...core.errors import InvalidArgument
 from ...core.frames import RESOLUTION
 from .restoration import NetworkConfig
 
@@ -60,18 +61,20 @@ class UNetConfig:
     def __post_init__(self) -> None:
         object.__setattr__(self, "multipliers", tuple(self.multipliers))
         if self.kind != KIND:
-            raise ValueError(f"UNetConfig: kind must be {KIND!r}, got {self.kind!r}")
+            raise InvalidArgument(f"UNetConfig: kind must be {KIND!r}, got {self.kind!r}")
         for name in ("base_width", "blocks", "heads", "groups"):
             if getattr(self, name) < 1:
-                raise ValueError(f"UNetConfig: {name} must be >= 1, got {getattr(self, name)}")
+                raise InvalidArgument(f"UNetConfig: {name} must be >= 1, got {getattr(self, name)}")
         if not self.multipliers or min(self.multipliers) < 1 or len(self.multipliers) > 5:
-            raise ValueError(f"UNetConfig: multipliers must be one to five integers >= 1, got {self.multipliers}")
+            raise InvalidArgument(f"UNetConfig: multipliers must be one to five integers >= 1, got {self.multipliers}")
         if self.base_width % self.groups or self.base_width % 2:
-            raise ValueError(
+            raise InvalidArgument(
                 f"UNetConfig: base_width must be even and a multiple of groups = {self.groups}, got {self.base_width}"
             )
         if self.widths[-1] % self.heads:
-            raise ValueError(f"UNetConfig: heads must divide the coarsest width {self.widths[-1]}, got {self.heads}")
+            raise InvalidArgument(
+                f"UNetConfig: heads must divide the coarsest width {self.widths[-1]}, got {self.heads}"
+            )
 
     @property
     def channels(self) -> Any:
@@ -295,10 +298,10 @@ class UNet(nn.Module):
 def _check_shapes(channels: Tensor, timestep: Tensor, edge_fraction: Tensor) -> None:
     count, cube = len(channels), (1, *(RESOLUTION,) * 3)
     if tuple(channels.shape) != (count, *cube):
-        raise ValueError(f"UNet: channels must have shape (N, *{cube}), got {tuple(channels.shape)}")
+        raise InvalidArgument(f"UNet: channels must have shape (N, *{cube}), got {tuple(channels.shape)}")
     for name, value in (("timestep", timestep), ("edge_fraction", edge_fraction)):
         if tuple(value.shape) != (count,):
-            raise ValueError(f"UNet: {name} must have shape ({count},), got {tuple(value.shape)}")
+            raise InvalidArgument(f"UNet: {name} must have shape ({count},), got {tuple(value.shape)}")
 
 
 def unet_gflop(config: UNetConfig) -> float:

@@ -28,6 +28,7 @@ from ...core.channels import (
     encode_known,
     stack_channels,
 )
+from ...core.errors import InvalidArgument, InvalidFile
 from ...core.schedule import timestep_from_severity
 from ...core.shards.packing import dequantize_share, dequantize_signed, unpack_labels
 from ...core.shards.storage import Shard, read_shard
@@ -161,17 +162,17 @@ class Mixture:
         redraw_edges: bool = True,
     ) -> None:
         if not shards:
-            raise ValueError("Mixture: at least one training shard is needed")
+            raise InvalidArgument("Mixture: at least one training shard is needed")
         weights = np.array([weight for _, weight in shards], dtype=np.float64)
         if not (np.isfinite(weights).all() and (weights > 0).all()):
-            raise ValueError(f"Mixture: weights must be finite and > 0, got {weights.tolist()}")
+            raise InvalidArgument(f"Mixture: weights must be finite and > 0, got {weights.tolist()}")
         if not 0.0 <= drop_channels <= 1.0:
-            raise ValueError(f"Mixture: drop_channels must lie in [0, 1], got {drop_channels}")
+            raise InvalidArgument(f"Mixture: drop_channels must lie in [0, 1], got {drop_channels}")
         self.channels = check_channels(channels, caller="Mixture")
         self.shards: list[Shard] = [read_shard(path) for path, _ in shards]
         for (path, _), shard in zip(shards, self.shards):
             if not len(shard):
-                raise ValueError(f"Mixture: {path} holds no cubes")
+                raise InvalidFile(f"Mixture: {path} holds no cubes")
         self.seed, self.drop_channels, self.redraw_edges = seed, drop_channels, redraw_edges
         self._cumulative = np.cumsum(weights) / weights.sum()
 

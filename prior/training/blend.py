@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.channels import stack_channels
+from ...core.errors import InvalidArgument
 from .batches import Batch, Mixture, any_edge, timesteps
 
 STREAM = 0x6F6E6C  # keeps the timesteps of online samples apart from the draws of the mixture
@@ -49,11 +50,11 @@ def split_batch(batch_size: int, shares: Sequence[float]) -> list[int]:
         ValueError: a share out of range, or more than there is.
     """
     if not all(0.0 < share <= 1.0 for share in shares):
-        raise ValueError(f"split_batch: the share of an online source must lie in (0, 1], got {list(shares)}")
+        raise InvalidArgument(f"split_batch: the share of an online source must lie in (0, 1], got {list(shares)}")
     counts = [max(1, round(share * batch_size)) for share in shares]
     rest = batch_size - sum(counts)
     if rest < 0 or sum(shares) > 1.0 + 1e-9:
-        raise ValueError(f"split_batch: online shares {list(shares)} are more than a batch of {batch_size} cubes")
+        raise InvalidArgument(f"split_batch: online shares {list(shares)} are more than a batch of {batch_size} cubes")
     return [rest, *counts]
 
 
@@ -87,7 +88,7 @@ class Blend:
         self.counts = split_batch(batch_size, [part.share for part in online])
         if (mixture is None) == bool(self.counts[0]):
             have = "no shards" if mixture is None else "shards"
-            raise ValueError(f"Blend: {have}, and {self.counts[0]} of {batch_size} cubes a step are left for them")
+            raise InvalidArgument(f"Blend: {have}, and {self.counts[0]} of {batch_size} cubes a step are left for them")
 
     def _completed(self, pairs: Pairs, step: int, number: int) -> Batch:
         """What a source gave, with timesteps, and with channels that say "unknown"."""

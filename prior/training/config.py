@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from ...core.config import from_dict, to_dict
+from ...core.errors import InvalidArgument
 from ..networks.registry import BackboneConfig, backbone_from_dict, network_for
 from ..networks.restoration import NetworkConfig
 
@@ -91,19 +92,19 @@ class TrainConfig:
         for name in (*positive, "checkpoint_seconds"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"TrainConfig: {name} must be finite and > 0, got {value}")
+                raise InvalidArgument(f"TrainConfig: {name} must be finite and > 0, got {value}")
         for name in ("weight_decay", "warmup_steps", "final_rate", "threads", "checkpoint_steps", "validate_seconds"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
-                raise ValueError(f"TrainConfig: {name} must be finite and >= 0, got {value}")
+                raise InvalidArgument(f"TrainConfig: {name} must be finite and >= 0, got {value}")
         if self.max_seconds is not None and not self.max_seconds > 0:
-            raise ValueError(f"TrainConfig: max_seconds must be > 0 or None, got {self.max_seconds}")
+            raise InvalidArgument(f"TrainConfig: max_seconds must be > 0 or None, got {self.max_seconds}")
         if not 0.0 <= self.drop_channels <= 1.0:
-            raise ValueError(f"TrainConfig: drop_channels must lie in [0, 1], got {self.drop_channels}")
+            raise InvalidArgument(f"TrainConfig: drop_channels must lie in [0, 1], got {self.drop_channels}")
         if not 0.0 <= self.ema_decay < 1.0:
-            raise ValueError(f"TrainConfig: ema_decay must lie in [0, 1), got {self.ema_decay}")
+            raise InvalidArgument(f"TrainConfig: ema_decay must lie in [0, 1), got {self.ema_decay}")
         if self.precision not in ("auto", "bf16", "fp32"):
-            raise ValueError(f"TrainConfig: precision must be 'auto', 'bf16' or 'fp32', got {self.precision!r}")
+            raise InvalidArgument(f"TrainConfig: precision must be 'auto', 'bf16' or 'fp32', got {self.precision!r}")
         network_for(self.objective, self.network)  # refuses an unknown objective
 
     def to_json(self) -> str:

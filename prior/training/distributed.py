@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
+from ...core.errors import InvalidArgument, UnghostError
 from .batches import Batch
 
 if TYPE_CHECKING:
@@ -28,7 +29,7 @@ TIMEOUT_SECONDS = 1800.0  # the others wait while rank 0 validates
 TIMEOUT_VARIABLE = "UNGHOST_RANK_TIMEOUT"  # in seconds, to change that
 
 
-class RankLost(RuntimeError):
+class RankLost(UnghostError, RuntimeError):
     """Another process of the run is gone or did not answer; the last checkpoint is good."""
 
 
@@ -48,7 +49,7 @@ class Group:
     def check(self, config: TrainConfig) -> None:
         """Refuse a configuration whose batches cannot be shared out evenly."""
         if config.batch_size % self.size:
-            raise ValueError(
+            raise InvalidArgument(
                 f"train: batch_size must be a multiple of the number of processes, "
                 f"got {config.batch_size} for {self.size}"
             )
@@ -143,5 +144,5 @@ def _timeout() -> float:
     except ValueError:
         seconds = 0.0
     if not 0 < seconds < float("inf"):
-        raise ValueError(f"train: {TIMEOUT_VARIABLE} must be a number of seconds > 0, got {text!r}")
+        raise InvalidArgument(f"train: {TIMEOUT_VARIABLE} must be a number of seconds > 0, got {text!r}")
     return seconds

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
+from ...core.errors import InvalidArgument
+
 
 class ExponentialMovingAverage:
     """``shadow <- d shadow + (1 - d) weights`` with ``d = min(decay, (1 + n) / (10 + n))`` at the n-th update.
@@ -16,7 +18,7 @@ class ExponentialMovingAverage:
 
     def __init__(self, network: nn.Module, *, decay: float) -> None:
         if not 0.0 <= decay < 1.0:
-            raise ValueError(f"ExponentialMovingAverage: decay must lie in [0, 1), got {decay}")
+            raise InvalidArgument(f"ExponentialMovingAverage: decay must lie in [0, 1), got {decay}")
         self.decay = decay
         self.updates = 0
         self.shadow: dict[str, Tensor] = {name: value.detach().clone() for name, value in network.state_dict().items()}

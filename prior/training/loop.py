@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from ...core.errors import InvalidArgument
 from ...core.io import write_text
 from ...core.manifest import Manifest
 from ...core.results import commit, versions
@@ -290,7 +291,7 @@ def train(
     """
     named = dict(validation_shards or {})
     if not set(_threshold_names(config)) <= set(named):
-        raise ValueError(f"train: threshold_from {config.threshold_from!r} is not among {sorted(named)}")
+        raise InvalidArgument(f"train: threshold_from {config.threshold_from!r} is not among {sorted(named)}")
     blend = _blend(config, train_shards, online)
     validation = {name: read_shard(path) for name, path in named.items()}
     if config.threads:

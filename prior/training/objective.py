@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from ...core.errors import InvalidArgument
 from ...core.occupancy import DEFAULT_OPACITY_THRESHOLD, IGNORE_LABEL, SURFACE_LABEL, opacity_from_signed
 
 
@@ -56,9 +57,9 @@ def restoration_loss(
         ``(N,)`` float32, 0 for a cube without a valid voxel.
     """
     if not interesting_weight > 0:
-        raise ValueError(f"restoration_loss: interesting_weight must be > 0, got {interesting_weight}")
+        raise InvalidArgument(f"restoration_loss: interesting_weight must be > 0, got {interesting_weight}")
     if logits.shape != signed_opacity.shape or logits[:, 0].shape != labels.shape:
-        raise ValueError(
+        raise InvalidArgument(
             f"restoration_loss: logits {tuple(logits.shape)}, labels {tuple(labels.shape)} and signed_opacity "
             f"{tuple(signed_opacity.shape)} must be (N, 1, R, R, R), (N, R, R, R) and (N, 1, R, R, R)"
         )

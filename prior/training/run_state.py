@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ...core.errors import InvalidArgument, InvalidFile, UnghostError
 from ..checkpoint import CONFIG_KEY, load_model, read_tensors, write_tensors
 from ..diffusion.model import DiffusionNet
 from ..diffusion.objective import diffusion_losses
@@ -23,7 +24,7 @@ from .ema import ExponentialMovingAverage
 from .objective import restoration_loss
 
 
-class TrainingDiverged(RuntimeError):
+class TrainingDiverged(UnghostError, RuntimeError):
     """The loss or the gradient stopped being finite; the last checkpoint is good."""
 
 
@@ -70,7 +71,9 @@ class Trainer:
             elif can_rewire(start.network, network):
                 rewire(start.network, network)
             else:
-                raise ValueError(f"Trainer: init_from {config.init_from} has another network: {start.network.config}")
+                raise InvalidArgument(
+                    f"Trainer: init_from {config.init_from} has another network: {start.network.config}"
+                )
             kept = (
                 "seed",
                 "steps",
@@ -170,7 +173,7 @@ class Trainer:
         """
         tensors, metadata = read_tensors(path)
         if not {"step", "elapsed", "updates"} <= set(metadata):
-            raise ValueError(f"Trainer.restore: {path} is not a training state")
+            raise InvalidFile(f"Trainer.restore: {path} is not a training state")
 
         def part(prefix: str) -> dict[str, Tensor]:
             return {k[len(prefix) :]: v.to(self.device) for k, v in tensors.items() if k.startswith(prefix)}
@@ -179,7 +182,7 @@ class Trainer:
             self.network.load_state_dict(part("live."))
             self.average.load(part("average."), updates=int(metadata["updates"]))
         except (RuntimeError, KeyError) as error:
-            raise ValueError(f"Trainer.restore: {path} holds another network ({error})") from None
+            raise InvalidFile(f"Trainer.restore: {path} holds another network ({error})") from None
         state: dict[int, dict[str, Any]] = {}
         for key, value in part("optimizer.").items():
             index, name = key.split(".", 1)

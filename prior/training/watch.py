@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from ...core.errors import InvalidArgument
 from ...core.frames import unit_lattice
 
 WATCH_STEPS = 100  # between looks at the network, beside one before each checkpoint
@@ -61,7 +62,7 @@ def input_dependence(network: nn.Module) -> float:
         for hook in hooks:
             hook.remove()
     if not given:
-        raise ValueError(f"input_dependence: {type(network).__name__} has no 3D convolution")
+        raise InvalidArgument(f"input_dependence: {type(network).__name__} has no 3D convolution")
     first, second = given[-1]
     level = torch.sqrt(0.5 * (first.square().mean() + second.square().mean()))
     return float((first - second).square().mean().sqrt() / level) if bool(level > 0) else 0.0

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.errors import InvalidArgument
 from ...core.lattice import cell_centers, cell_pitch
 from ...core.occupancy import OccupancyRule
 from .furniture import Floats, Solid, solids
@@ -102,7 +103,7 @@ def build_room(seed: int = 0) -> Room:
         ValueError: ``seed`` is negative.
     """
     if seed < 0:
-        raise ValueError(f"build_room: seed must be >= 0, got {seed}")
+        raise InvalidArgument(f"build_room: seed must be >= 0, got {seed}")
     rng = np.random.default_rng([seed, 0])
     positions, pitch = cell_centers(AABB, SHAPE), cell_pitch(AABB, SHAPE)
     distance, color = _merge(solids(rng), positions, pitch)

@@ -99,7 +99,7 @@ def test_an_error_in_a_worker_names_the_sample(mesh_root, workers):
     (mesh_root / "ball.ply").write_bytes(b"ply\nrubbish\n")
     with (
         closing(pairs.stream(3, 4)) as stream,
-        pytest.raises(SampleError, match=r"sample 12 of seed 0: ValueError: .*ball\.ply"),
+        pytest.raises(SampleError, match=r"sample 12 of seed 0: curate: none of .*ball\.ply"),
     ):
         next(stream)
     assert multiprocessing.active_children() == []

@@ -8,6 +8,8 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
+from ..core.errors import InvalidArgument, MissingExtra
+
 
 def capture(
     train: Positional[Annotated[Path, arg(metavar="TRAIN")]],
@@ -109,7 +111,7 @@ def convert(
     if plot is not None:
         _check_plot(plot, "convert")
     if every is not None and eval_split is not None:
-        raise ValueError("convert: --every takes its photos from the training sweep: leave --eval-split out")
+        raise InvalidArgument("convert: --every takes its photos from the training sweep: leave --eval-split out")
     posed, told = _read(capture, splits, missing, photos)
     print("\n".join(told), end="\n" if told else "")
     if every is None:
@@ -133,9 +135,9 @@ def _check_plot(path: Path, verb: str) -> None:
     import importlib.util
 
     if path.suffix.lower() != ".png":
-        raise ValueError(f"{verb}: --plot must end in .png, got {path}")
+        raise InvalidArgument(f"{verb}: --plot must end in .png, got {path}")
     if importlib.util.find_spec("matplotlib") is None:
-        raise ImportError(f"{verb}: --plot needs matplotlib: pip install unghost[capture]")
+        raise MissingExtra(f"{verb}: --plot needs matplotlib: pip install unghost[capture]")
 
 
 def _read(folder: Path, splits: Path | None, missing: str, photos: Path | None) -> tuple[Any, list[str]]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, UseAppendAction, arg
 
+from ..core.errors import InvalidArgument
 from .prior import Threads
 
 if TYPE_CHECKING:
@@ -61,7 +62,7 @@ def clean(
     keep = None if preview or (mask and keep is None) else keep or source.with_name(f"{source.stem}-keep.npz")
     _check_distinct(source=source, out=target, keep=keep, preview=preview, mask=mask)
     if not splats and (resolution is not None or reach is not None or scores_only):
-        raise ValueError(
+        raise InvalidArgument(
             f"clean: --resolution, --reach and --scores-only are for splats (.ply); {source.name} is a grid"
         )
     boxes = [[box[:3], box[3:]] for box in keep_box]
@@ -110,7 +111,7 @@ def _check_distinct(**files: Path | None) -> None:
     for index, (name, path) in enumerate(named):
         for other, same in named[:index]:
             if path == same or (path.exists() and same.exists() and path.samefile(same)):
-                raise ValueError(f"clean: {name} and {other} are the same file, {path.name}; write to another")
+                raise InvalidArgument(f"clean: {name} and {other} are the same file, {path.name}; write to another")
 
 
 def _clean_grid(
@@ -124,7 +125,9 @@ def _clean_grid(
     if mask is None:
         mask = clean(density_fn, aabb, field_pitch=cell_pitch(aabb, density.shape, caller="clean"), **options)
     elif abs(mask.aabb - aabb).max() > 1e-4 * float((aabb[1] - aabb[0]).max()):
-        raise ValueError(f"clean: the mask's box must be {source.name}'s {aabb.tolist()}, got {mask.aabb.tolist()}")
+        raise InvalidArgument(
+            f"clean: the mask's box must be {source.name}'s {aabb.tolist()}, got {mask.aabb.tolist()}"
+        )
     if target is not None:
         save_grid(target, mask.apply_grid(density), aabb)
     return mask, density_fn

@@ -10,6 +10,8 @@ from typing import Literal
 
 from tyro.conf import Positional
 
+from ..core.errors import InvalidArgument
+
 
 def evaluate(
     renders: Positional[tuple[str, ...]],
@@ -114,6 +116,6 @@ def _named(given: Sequence[str]) -> dict[str, Path]:
         path = Path(word) if cut is None or alone else Path(word[cut + 1 :])
         name = path.resolve().name if alone else word[:cut]
         if name in found:
-            raise ValueError(f"evaluate: two methods are called {name!r} ({found[name]} and {path}); say NAME=DIR")
+            raise InvalidArgument(f"evaluate: two methods are called {name!r} ({found[name]} and {path}); say NAME=DIR")
         found[name] = path
     return found

@@ -8,22 +8,24 @@ from typing import Any, Literal
 
 from tyro.conf import Positional
 
+from ..core.errors import InvalidFile
+
 
 def _depth_maps(path: Path, key: str) -> Any:
     """``(n, H, W)`` from a .npy, or from ``key`` of an .npz."""
     import numpy as np
 
     if not path.is_file():
-        raise ValueError(f"masks: no file {path}")
+        raise InvalidFile(f"masks: no file {path}")
     try:
         loaded = np.load(path, allow_pickle=False)
         values = loaded if isinstance(loaded, np.ndarray) else loaded[key]
     except KeyError:
-        raise ValueError(f"masks: {path} holds {', '.join(loaded.files)}, but no {key!r}") from None
+        raise InvalidFile(f"masks: {path} holds {', '.join(loaded.files)}, but no {key!r}") from None
     except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:
-        raise ValueError(f"masks: {path} is no .npy or .npz of numbers ({type(error).__name__})") from None
+        raise InvalidFile(f"masks: {path} is no .npy or .npz of numbers ({type(error).__name__})") from None
     if values.ndim != 3:
-        raise ValueError(f"masks: {path} must hold depth (views, height, width), got shape {values.shape}")
+        raise InvalidFile(f"masks: {path} must hold depth (views, height, width), got shape {values.shape}")
     return values
 
 

@@ -10,6 +10,8 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
+from ..core.errors import InvalidArgument
+
 
 def curate(
     recipe: Positional[str],
@@ -109,7 +111,9 @@ def _named_share(spec: str) -> tuple[str, float]:
     try:
         return name, float(number) if separator else 1.0
     except ValueError:
-        raise ValueError(f"harvest: --kinds must be NAME or NAME=SHARE, the share a number, got {spec!r}") from None
+        raise InvalidArgument(
+            f"harvest: --kinds must be NAME or NAME=SHARE, the share a number, got {spec!r}"
+        ) from None
 
 
 def preview(

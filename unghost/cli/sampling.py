@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
+from ..core.errors import InvalidArgument, MissingExtra
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -48,10 +50,12 @@ def sample(
     except ModuleNotFoundError as error:
         if error.name not in ("torch", "safetensors"):
             raise
-        raise ImportError(f"sample: needs {error.name}: pip install unghost[torch]") from error
+        raise MissingExtra(f"sample: needs {error.name}: pip install unghost[torch]") from error
     denoiser = load_model(model, device=torch.device(device))
     if not isinstance(denoiser.network, DiffusionNet):
-        raise ValueError(f"sample: {model} is of family {denoiser.manifest.family!r}; only 'diffusion' can be sampled")
+        raise InvalidArgument(
+            f"sample: {model} is of family {denoiser.manifest.family!r}; only 'diffusion' can be sampled"
+        )
     calls = steps * -(-count // max(batch_size, 1))
     with tqdm(total=calls, unit="step", dynamic_ncols=True) as bar:
         cubes = sample_cubes(

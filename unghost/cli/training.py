@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional, UseAppendAction
 
+from ..core.errors import InvalidArgument
 from ..core.shards.finding import expand_shards
 
 if TYPE_CHECKING:
@@ -23,7 +24,7 @@ def _named_shards(specs: list[str]) -> dict[str, Path]:
     for spec in specs:
         name, separator, folder = spec.partition("=")
         if not (name and separator and folder):
-            raise ValueError(f"train: --validation must be NAME=FOLDER, got {spec!r}")
+            raise InvalidArgument(f"train: --validation must be NAME=FOLDER, got {spec!r}")
         found = expand_shards(folder)
         for path, _ in found:
             table[name if len(found) == 1 else f"{name}/{path.name}"] = path
@@ -44,7 +45,7 @@ def _online(specs: list[str], *, seed: int, workers: int, mesh_root: Path | None
         except ValueError:
             share = 0.0
         if not (name and 0.0 < share <= 1.0):
-            raise ValueError(f"train: --online must be RECIPE=SHARE, the share in (0, 1], got {spec!r}")
+            raise InvalidArgument(f"train: --online must be RECIPE=SHARE, the share in (0, 1], got {spec!r}")
         pairs = OnlinePairs(load_recipe(name), seed=ONLINE_SEED + seed, workers=workers, mesh_root=mesh_root)
         sources.append(Online(Path(name).stem, share, pairs))
     return sources
@@ -58,11 +59,13 @@ def _configured(file: Path | None, size: str | None, channels: tuple[str, ...], 
 
     base = TrainConfig() if file is None else TrainConfig.from_dict(read_json(file, caller="train"))
     if size is not None and size not in SIZES:
-        raise ValueError(f"train: --size must be one of {', '.join(SIZES)}, got {size!r}")
+        raise InvalidArgument(f"train: --size must be one of {', '.join(SIZES)}, got {size!r}")
     network = base.network if size is None else dataclasses.replace(SIZES[size], channels=base.network.channels)
     if channels:
         if not isinstance(network, NetworkConfig):
-            raise ValueError(f"train: --channels needs a restoration network, --config has a {type(network).__name__}")
+            raise InvalidArgument(
+                f"train: --channels needs a restoration network, --config has a {type(network).__name__}"
+            )
         network = dataclasses.replace(network, channels=channels)
     said = {key: value for key, value in given.items() if value is not None}
     return dataclasses.replace(base, **said, network=network)

@@ -7,6 +7,8 @@ from typing import Any, Literal
 
 from tyro.conf import Positional
 
+from ..core.errors import InvalidArgument, InvalidFile
+
 KIND = "uncertainty"
 
 
@@ -85,7 +87,7 @@ def doubt(
 
 def _there(depth: Any, folder: Path) -> Any:
     if depth is None:
-        raise ValueError(f"doubt: {folder} holds no depth maps (depth/NAME.npy, or maps.npz with depth)")
+        raise InvalidFile(f"doubt: {folder} holds no depth maps (depth/NAME.npy, or maps.npz with depth)")
     return depth
 
 
@@ -95,7 +97,7 @@ def _check_free(renders: Path, replace: bool) -> None:
         folder = renders / kind
         if folder.is_dir() and any(folder.iterdir()) and (kind != KIND or not replace):
             advice = "say --replace" if kind == KIND else "move it away"
-            raise ValueError(f"doubt: {folder} is there already; {advice}")
+            raise InvalidArgument(f"doubt: {folder} is there already; {advice}")
 
 
 def _write(path: Path, values: Any) -> None:

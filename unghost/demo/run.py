@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.errors import InvalidArgument
 from ..core.occupancy import OccupancyRule
 from ..core.results import build_results, write_results
 from ..denoisers import load_denoiser
@@ -74,7 +75,7 @@ def score(room: Room, kept: Mask) -> dict[str, Any]:
         ``iou_before`` and ``iou`` of the occupied cells with the surface, ``recall_by_kind``.
     """
     if kept.shape != SHAPE or kept.dtype != np.bool_:
-        raise ValueError(f"score: kept must be bool {SHAPE}, got {kept.dtype} {kept.shape}")
+        raise InvalidArgument(f"score: kept must be bool {SHAPE}, got {kept.dtype} {kept.shape}")
     occupied, surface = room.occupied(RULE), room.surface(RULE)
     ghosts, removed, left = occupied & ~surface, occupied & ~kept, occupied & kept
     return {

@@ -133,7 +133,7 @@ def test_missing_trimesh_names_the_extra(tmp_path):
         f"load_mesh({str(tmp_path / 'a.ply')!r})"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert "ImportError: load_mesh: reading meshes needs trimesh: pip install unghost[recipes]" in run.stderr
+    assert "MissingExtra: load_mesh: reading meshes needs trimesh: pip install unghost[recipes]" in run.stderr
 
 
 def test_only_the_allowed_licences_split_and_formats(mesh_root):

@@ -121,4 +121,4 @@ def test_missing_manifold3d_names_the_extra():
         "random_solid(np.random.default_rng(0))"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert "ImportError: csg: boolean solids need manifold3d: pip install unghost[recipes]" in run.stderr
+    assert "MissingExtra: csg: boolean solids need manifold3d: pip install unghost[recipes]" in run.stderr

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.errors import InvalidArgument, InvalidFile
 from ...evaluation.scoring.conventions import DEPTH_KEYS, NORMAL_KEYS, SceneExtent, get_convention
 from ...evaluation.scoring.engine import score_scene
 from ...evaluation.scoring.pseudo_truth import PseudoTruth, load_pseudo_truth
@@ -69,9 +70,11 @@ class MaskedProtocol:
             ValueError: not one image, another size, or a map missing that the convention needs (named).
         """
         if len(dataset["images"]) != 1:
-            raise ValueError(f"{self.get_name()}: evaluate takes one image, got {len(dataset['images'])}")
+            raise InvalidArgument(f"{self.get_name()}: evaluate takes one image, got {len(dataset['images'])}")
         if dataset.get("metadata", {}).get("color_space", "srgb") != "srgb":
-            raise ValueError(f"{self.get_name()}: colours must be sRGB, got {dataset['metadata']['color_space']!r}")
+            raise InvalidArgument(
+                f"{self.get_name()}: colours must be sRGB, got {dataset['metadata']['color_space']!r}"
+            )
         photo = _colours(dataset["images"][0])
         name = _name(dataset)
         depth, accumulation = predictions.get("depth"), predictions.get("accumulation")
@@ -149,11 +152,11 @@ PROTOCOLS = (WholeImage, VisibleOnly, Proper, PaperText, PaperCode)
 def _colours(image: NDArray[Any]) -> NDArray[Any]:
     array = np.asarray(image)
     if array.ndim != 3 or array.shape[-1] not in (3, 4):
-        raise ValueError(f"unghost's protocols: an image must have shape (H, W, 3), got {array.shape}")
+        raise InvalidFile(f"unghost's protocols: an image must have shape (H, W, 3), got {array.shape}")
     if array.dtype == np.uint8:
         array = array.astype(np.float32) / np.float32(255)
     if array.shape[-1] == 4 and (array[..., 3] < 1).any():
-        raise ValueError("unghost's protocols: an image has transparent pixels; put it on a background first")
+        raise InvalidFile("unghost's protocols: an image has transparent pixels; put it on a background first")
     return array[..., :3]
 
 
@@ -187,6 +190,6 @@ def _stored_depth(dataset: Mapping[str, Any], name: str) -> NDArray[np.float32] 
     raw = path.read_bytes()
     height, width = struct.unpack("<ii", raw[:8]) if len(raw) >= 8 else (0, 0)
     if height < 1 or width < 1 or len(raw) != 8 + 2 * height * width:
-        raise ValueError(f"unghost's protocols: {path} is no depth map of nerfbaselines, or is truncated")
+        raise InvalidFile(f"unghost's protocols: {path} is no depth map of nerfbaselines, or is truncated")
     depth = np.frombuffer(raw, dtype="<f2", offset=8).reshape(height, width).astype(np.float32)
     return np.where(depth == 0, np.float32(np.inf), depth)

@@ -13,6 +13,7 @@ import numpy as np
 from nerfstudio.models.nerfacto import NerfactoModel, NerfactoModelConfig
 
 from ...core.cameras import Cameras
+from ...core.errors import InvalidArgument
 
 
 @dataclass
@@ -49,7 +50,7 @@ def cameras_of(cameras: Any) -> Cameras:
 
     kinds = {int(kind) for kind in np.asarray(cameras.camera_type.cpu()).ravel()}
     if kinds != {CameraType.PERSPECTIVE.value}:
-        raise ValueError(f"cameras_of: cameras must be perspective ones, got camera_type {sorted(kinds)}")
+        raise InvalidArgument(f"cameras_of: cameras must be perspective ones, got camera_type {sorted(kinds)}")
     width, height = (side.reshape(-1).double().cpu().numpy() for side in (cameras.width, cameras.height))
     scale = np.stack([width[0] / width, height[0] / height] * 2, axis=1)
     lens = np.stack([getattr(cameras, name).reshape(-1).double().cpu().numpy() for name in ("fx", "fy", "cx", "cy")], 1)
