@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from ..core.errors import InvalidArgument
+from ..core.errors import InvalidArgument, needs_extra
 from ..core.manifest import Manifest
 from ..core.occupancy import (
     DEFAULT_OPACITY_THRESHOLD,
@@ -139,7 +139,8 @@ def total_variation(values: Values) -> Values:
         >>> bool(total_variation(values).max() < 1)
         True
     """
-    from skimage.restoration import denoise_tv_chambolle
+    with needs_extra("eval", caller="total_variation"):
+        from skimage.restoration import denoise_tv_chambolle
 
     result: Values = denoise_tv_chambolle(  # type: ignore[no-untyped-call]
         values.astype(np.float64), weight=0.6, max_num_iter=60

@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from .errors import MissingExtra as MissingExtra
     from .errors import MissingFile as MissingFile
     from .errors import UnghostError as UnghostError
+    from .errors import needs_extra as needs_extra
     from .frames import RESOLUTION as RESOLUTION
     from .frames import CubeFrame as CubeFrame
     from .frames import cube_lattices as cube_lattices
@@ -127,7 +128,15 @@ __getattr__, __dir__, __all__ = attach(
             "with_unknown",
         ],
         ".config": ["check_keys", "from_dict", "nearest", "override", "to_dict"],
-        ".errors": ["InvalidArgument", "InvalidFile", "InvalidType", "MissingExtra", "MissingFile", "UnghostError"],
+        ".errors": [
+            "InvalidArgument",
+            "InvalidFile",
+            "InvalidType",
+            "MissingExtra",
+            "MissingFile",
+            "UnghostError",
+            "needs_extra",
+        ],
         ".frames": ["CubeFrame", "RESOLUTION", "cube_lattices", "random_rotations", "unit_lattice"],
         ".interpolate": ["corner_weights", "interpolate_grid", "lower_nodes", "trilinear_corners"],
         ".lattice": ["cell_centers", "cell_pitch", "cells_within", "lattice_axes", "lattice_origin", "look_up_cells"],

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..core.channels import with_unknown
-from ..core.errors import InvalidArgument, InvalidFile, InvalidType, MissingExtra
+from ..core.errors import InvalidArgument, InvalidFile, InvalidType, needs_extra
 from ..core.io import write_bytes
 from ..core.manifest import METADATA_KEY, Manifest
 from ..core.schedule import TIMESTEPS
@@ -30,10 +30,8 @@ def _ordered(data: bytes) -> bytes:
 
 def write_tensors(path: str | Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
     """Write a safetensors file, whole or not at all; equal contents give equal bytes."""
-    try:
+    with needs_extra("torch", caller="write_tensors"):
         from safetensors.torch import save
-    except ImportError:
-        raise MissingExtra("write_tensors: needs safetensors: pip install unghost[torch]") from None
     plain = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
     write_bytes(path, _ordered(save(plain, dict(metadata))), fsync=True)
 
@@ -44,10 +42,8 @@ def read_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     Raises:
         ValueError: missing, truncated, or another kind of file.
     """
-    try:
+    with needs_extra("torch", caller="read_tensors"):
         from safetensors import SafetensorError, safe_open
-    except ImportError:
-        raise MissingExtra("read_tensors: needs safetensors: pip install unghost[torch]") from None
     source = Path(path)
     if not source.is_file():
         raise InvalidFile(f"read_tensors: {source} does not exist or is not a file")

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.cameras import Cameras
+from ..core.errors import needs_extra
 from ..core.interpolate import interpolate_grid
 
 Floats = NDArray[np.float32]
@@ -44,7 +45,8 @@ def look_at(eye: Any, target: Any, *, width: int, height: int, fov_degrees: floa
 
 def _sunlight(depth: Floats) -> Floats:
     """Share of the sun that reaches each cell: slabs swept from the top, each shifted along the sun's slant."""
-    from scipy.ndimage import shift
+    with needs_extra("demo", caller="render"):
+        from scipy.ndimage import shift
 
     light = np.ones_like(depth)
     slant = SUN[:2] / SUN[2]
@@ -71,7 +73,8 @@ def shade(density: Floats, color: Floats, aabb: NDArray[np.float64], pitch: floa
         >>> shade(density, np.full((8, 8, 8, 3), 0.5, np.float32), aabb, 0.25).samples.shape
         (8, 8, 8, 4)
     """
-    from scipy.ndimage import gaussian_filter, maximum_filter
+    with needs_extra("demo", caller="render"):
+        from scipy.ndimage import gaussian_filter, maximum_filter
 
     depth = np.minimum(density * pitch, 8.0).astype(np.float32)
     solid = gaussian_filter(1.0 - np.exp(-depth), 1.0)
@@ -109,7 +112,8 @@ def render(volume: Volume, camera: Cameras, *, steps_per_cell: float = 1.6) -> F
         >>> picture.shape, bool(np.allclose(picture[0, 0], PAPER, atol=1e-6))  # a corner shows the background
         ((12, 16, 3), True)
     """
-    from scipy.ndimage import distance_transform_cdt, maximum_filter
+    with needs_extra("demo", caller="render"):
+        from scipy.ndimage import distance_transform_cdt, maximum_filter
 
     origins, directions = (values.reshape(-1, 3) for values in camera.rays(0))
     near, far = _interval(volume.aabb, origins, directions)

@@ -152,8 +152,8 @@ def read_splat_ply(path: str | Path) -> SplatPly:
     if not source.is_file():
         raise MissingFile(f"read_splat_ply: no file {source}")
 
-    def refuse(rule: str) -> ValueError:
-        return ValueError(f"read_splat_ply: {source} is not a PLY of Gaussian splats: {rule}")
+    def refuse(rule: str) -> InvalidFile:
+        return InvalidFile(f"read_splat_ply: {source} is not a PLY of Gaussian splats: {rule}")
 
     with source.open("rb") as stream:
         start = stream.read(MOST_HEADER)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ...core.aabb import scene_extent
 from ...core.channels import full_channel
 from ...core.config import to_dict
-from ...core.errors import InvalidArgument
+from ...core.errors import InvalidArgument, needs_extra
 from ...core.frames import RESOLUTION, cube_lattices, random_rotations
 from ...core.occupancy import DEFAULT_OPACITY_THRESHOLD, opacity_from_density, opacity_from_signed
 from ...core.shards.packing import (
@@ -54,7 +54,8 @@ TOGETHER, QUERY = 8, 1 << 17  # cubes, and points in them, that are worked on at
 @contextmanager
 def _one_thread() -> Iterator[None]:
     """torch in one thread: gradients summed in several differ from run to run in their last bits."""
-    import torch
+    with needs_extra("torch", caller="harvest"):
+        import torch
 
     before = torch.get_num_threads()
     torch.set_num_threads(1)

@@ -40,7 +40,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...core.errors import InvalidArgument
+from ...core.errors import InvalidArgument, needs_extra
 from ...core.frames import RESOLUTION
 from ...core.occupancy import DEFAULT_OPACITY_THRESHOLD, FREE_LABEL, IGNORE_LABEL, SURFACE_LABEL, opacity_from_signed
 from ...core.shards.packing import dequantize_signed, quantize_signed, unpack_labels
@@ -142,7 +142,8 @@ def cube_features(signed: NDArray[np.floating], labels: NDArray[np.uint8] | None
     Returns:
         Those of ``FEATURES``, and with labels those of ``AGREEMENT``.
     """
-    from scipy.ndimage import label
+    with needs_extra("recipes", caller="cube_features"):
+        from scipy.ndimage import label
 
     opacity = opacity_from_signed(signed)
     occupied: Occupancy = opacity > DEFAULT_OPACITY_THRESHOLD

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.errors import needs_extra
+
 Values = NDArray[np.float64]
 Occupancy = NDArray[np.bool_]
 
@@ -16,7 +18,8 @@ def half_lattice_distance(occupied: Occupancy) -> Values:
     it touches are. A slab of T voxels then has the distance T / 2 in its middle, whether T is odd or even. Beyond the
     array nothing is known: only what is empty inside counts (inf everywhere if nothing is).
     """
-    from scipy.ndimage import distance_transform_edt
+    with needs_extra("recipes", caller="thickness"):
+        from scipy.ndimage import distance_transform_edt
 
     fine: Occupancy = occupied
     for axis in range(3):

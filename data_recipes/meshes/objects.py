@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.distances.sampled import SampledDistance
-from ...core.errors import InvalidArgument
+from ...core.errors import InvalidArgument, needs_extra
 from ..recipe import load_recipe
 from .sources import open_library
 
@@ -34,7 +34,8 @@ def solid_from_triangles(triangles: NDArray[Any], *, cells: int = CELLS) -> Samp
     Raises:
         ValueError: fewer than 4 cells, or a soup without extent.
     """
-    from scipy.ndimage import label
+    with needs_extra("recipes", caller="solid_from_triangles"):
+        from scipy.ndimage import label
 
     soup = np.asarray(triangles, dtype=np.float32)
     if cells < 4:

@@ -20,7 +20,7 @@ from ...core.channels import (
     encode_view_count,
     stack_channels,
 )
-from ...core.errors import InvalidArgument, MissingExtra
+from ...core.errors import InvalidArgument, needs_extra
 from ...core.frames import RESOLUTION, unit_lattice
 from ...core.manifest import Denoiser, Manifest
 from ...core.occupancy import EMPTY, OCCUPIED, occupancy_from_signed, signed_from_opacity
@@ -200,10 +200,8 @@ def verify(
         ImportError: torch or safetensors is missing.
         ValueError: either file is unreadable, or they take different channels.
     """
-    try:
+    with needs_extra("export", caller="verify"):
         from ...prior.checkpoint import load_model
-    except ImportError as error:
-        raise MissingExtra(f"verify: needs {error.name}: pip install unghost[export]") from None
     from ..runtime import OnnxDenoiser
 
     exported = OnnxDenoiser(onnx_path, threads=threads, providers=["CPUExecutionProvider"])

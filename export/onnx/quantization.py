@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core.errors import InvalidArgument, MissingExtra
+from ...core.errors import InvalidArgument, needs_extra
 from ...core.manifest import Manifest
 from ...core.schedule import TIMESTEPS
 from ..container import PRECISIONS, body_of, precision_of, unseal, write_sealed
@@ -224,10 +224,8 @@ def convert_onnx(
     if precision_of(manifest) != "fp32":
         raise InvalidArgument(f"convert_onnx: {onnx_path} is {precision_of(manifest)} already, an fp32 file is needed")
     body = body_of(data, manifest)
-    try:
+    with needs_extra("export", caller="convert_onnx"):
         converted = body_in(precision, body, calibration)
-    except ImportError as error:
-        raise MissingExtra(f"convert_onnx: needs {error.name}: pip install unghost[export]") from None
     facts: dict[str, Any] = {"fp32_sha256": manifest.body_sha256}
     if precision == "int8" and calibration is not None:
         facts |= {"calibration": source, "calibration_cubes": len(calibration.channels)}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ...core.errors import InvalidArgument, MissingExtra
+from ...core.errors import InvalidArgument, needs_extra
 from ...core.manifest import Manifest
 from ..container import write_sealed
 
@@ -29,13 +29,11 @@ def export_onnx(checkpoint_path: str | Path, out_path: str | Path, *, verify_cub
         ImportError: torch, safetensors or onnx is missing.
         ValueError: an unreadable checkpoint, or outputs that differ by more than 1e-4 (2e-3 for a U-Net).
     """
-    try:
+    with needs_extra("export", caller="export_onnx"):
         import onnx
 
         from ...prior.checkpoint import load_model
         from .diffusion_graph import denoiser_model, export_tolerance
-    except ImportError as error:
-        raise MissingExtra(f"export_onnx: needs {error.name}: pip install unghost[export]") from None
     denoiser = load_model(checkpoint_path)
     model = denoiser_model(denoiser.network)
     onnx.checker.check_model(model, full_check=True)

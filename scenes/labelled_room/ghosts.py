@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.distances import signed as sd
+from ...core.errors import needs_extra
 from ...core.frames import random_rotations
 
 Floats = NDArray[np.float32]
@@ -32,7 +33,8 @@ def sigmoid(values: Any) -> Floats:
 
 def smooth_noise(rng: np.random.Generator, shape: tuple[int, ...], cells: float) -> Floats:
     """Gaussian noise of ``shape``, blurred over ``cells``, mean 0, standard deviation 1."""
-    from scipy.ndimage import gaussian_filter
+    with needs_extra("demo", caller="smooth_noise"):
+        from scipy.ndimage import gaussian_filter
 
     noise = gaussian_filter(rng.normal(size=shape).astype(np.float32), cells, mode="wrap")
     return np.asarray((noise - noise.mean()) / noise.std(), dtype=np.float32)

@@ -6,19 +6,28 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
-USER_ERRORS = (ValueError, TypeError, OSError, ImportError)
+from ..core.errors import UnghostError
+
+USER_ERRORS = (UnghostError, OSError)  # what the user can mend; anything else is a bug of ours
 USAGE_EXIT, INTERRUPTED_EXIT = 2, 130
+TRACEBACK = "--traceback"
+
+
+DESCRIPTION = f"""Take ghosts out of radiance fields.
+
+An error that you can mend is one line; {TRACEBACK} after any verb shows where it arose."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one verb.
 
     Args:
-        argv: the words after ``unghost``; those of the process if None.
+        argv: the words after ``unghost``; those of the process if None. ``--traceback`` may stand anywhere among them.
 
     Returns:
-        0, or the status that the verb chose. What the user can mend (a missing file, an impossible
-        value, a missing extra) prints one line, ``unghost VERB: message``, to stderr and gives 2.
+        0, or the status that the verb chose. What the user can mend (a missing file, an impossible value, a missing
+        extra: :class:`~unghost.core.errors.UnghostError` and ``OSError``) prints one line, ``unghost VERB: message``,
+        to stderr and gives 2. Any other error is raised, and so is every one with ``--traceback``.
     """
     import tyro
 
@@ -50,15 +59,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         "export": commands_prior.export,
         "verify": commands_prior.verify,
     }
-    words = list(sys.argv[1:] if argv is None else argv)
+    given = list(sys.argv[1:] if argv is None else argv)
+    words = [word for word in given if word != TRACEBACK]
     verb = next((word for word in words if word in verbs), "")
     try:
         status: int | None = tyro.extras.subcommand_cli_from_dict(
-            verbs, prog="unghost", args=words, description="Take ghosts out of radiance fields."
+            verbs, prog="unghost", args=words, description=DESCRIPTION
         )
     except USER_ERRORS as error:
-        if isinstance(error, ImportError) and (error.name or "").startswith("unghost"):
-            raise  # a part of ours is missing: not the user's doing
+        if len(words) < len(given):
+            raise
         message = " ".join(str(error).split()) or type(error).__name__
         print(f"unghost {verb}: {message}", file=sys.stderr)
         return USAGE_EXIT

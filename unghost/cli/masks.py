@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from tyro.conf import Positional
 
-from ..core.errors import InvalidFile
+from ..core.errors import InvalidFile, needs_extra
 
 
 def _depth_maps(path: Path, key: str) -> Any:
@@ -60,7 +60,9 @@ def masks(
             units if its dataparser does not turn the scene (--orientation-method none).
     """
     import numpy as np
-    from PIL import Image
+
+    with needs_extra("eval", caller="masks"):
+        from PIL import Image
 
     from ..evaluation.captures.loading import load_capture
     from ..evaluation.scoring.depths import ray_depth

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
-from ..core.errors import InvalidArgument, MissingExtra
+from ..core.errors import InvalidArgument, needs_extra
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -40,17 +40,13 @@ def sample(
         batch_size: cubes at a time.
         device: as torch names it.
     """
-    try:
+    with needs_extra("torch", caller="sample"):
         import torch
         from tqdm import tqdm
 
         from ..prior.checkpoint import load_model
         from ..prior.diffusion.model import DiffusionNet
         from ..prior.diffusion.sampling import sample_cubes
-    except ModuleNotFoundError as error:
-        if error.name not in ("torch", "safetensors"):
-            raise
-        raise MissingExtra(f"sample: needs {error.name}: pip install unghost[torch]") from error
     denoiser = load_model(model, device=torch.device(device))
     if not isinstance(denoiser.network, DiffusionNet):
         raise InvalidArgument(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional, UseAppendAction
 
-from ..core.errors import InvalidArgument
+from ..core.errors import InvalidArgument, needs_extra
 from ..core.shards.finding import expand_shards
 
 if TYPE_CHECKING:
@@ -123,8 +123,9 @@ def train(
         mesh_root: folder with the meshes and their manifest.csv, for recipes that read meshes.
         resume: go on where a killed run stopped.
     """
-    from ..prior.training.allocator import keep_freed_memory
-    from ..prior.training.loop import train as run
+    with needs_extra("torch", caller="train"):
+        from ..prior.training.allocator import keep_freed_memory
+        from ..prior.training.loop import train as run
 
     keep_freed_memory()
     given: dict[str, Any] = {

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from tyro.conf import Positional
 
-from ..core.errors import InvalidArgument, InvalidFile
+from ..core.errors import InvalidArgument, InvalidFile, needs_extra
 
 KIND = "uncertainty"
 
@@ -102,7 +102,9 @@ def _check_free(renders: Path, replace: bool) -> None:
 
 def _write(path: Path, values: Any) -> None:
     import numpy as np
-    from PIL import Image
+
+    with needs_extra("eval", caller="doubt"):
+        from PIL import Image
 
     path.parent.mkdir(parents=True, exist_ok=True)
     np.save(path, values)

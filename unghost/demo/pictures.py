@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.errors import needs_extra
 from ..core.occupancy import OccupancyRule, opacity_from_density
 from ..scenes.labelled_room.room import AABB, Room
 from ..scenes.volume_renderer import Floats, look_at, render, shade
@@ -20,7 +21,8 @@ LABELS = {"clean": "unghost clean", "components": "largest component"}
 
 
 def _png(image: Floats) -> bytes:
-    from matplotlib.image import imsave
+    with needs_extra("demo", caller="demo"):
+        from matplotlib.image import imsave
 
     stream = io.BytesIO()
     imsave(stream, image, format="png")
@@ -62,7 +64,8 @@ def _panel(axes: Any, room: Room, kept: Mask | None, index: tuple[Any, ...], rul
 
 def draw_sections(room: Room, kept: Mapping[str, Mask], rule: OccupancyRule) -> bytes:
     """A PNG of one level and one upright cut through the room, a column per state."""
-    from matplotlib.figure import Figure
+    with needs_extra("demo", caller="demo"):
+        from matplotlib.figure import Figure
 
     states: dict[str, Mask | None] = {"before": None}
     states |= {LABELS.get(name, name): mask for name, mask in kept.items()}

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import InvalidArgument
+from ..core.errors import InvalidArgument, needs_extra
 from ..core.occupancy import OccupancyRule
 from ..core.results import build_results, write_results
 from ..denoisers import load_denoiser
@@ -43,7 +43,8 @@ def _run_clean(room: Room, denoiser: Any) -> Mask:
 
 def _run_components(room: Room, denoiser: Any) -> Mask:
     """Plain connected-component removal: of all that is occupied, keep the largest piece."""
-    from scipy.ndimage import label
+    with needs_extra("demo", caller="demo"):
+        from scipy.ndimage import label
 
     pieces, _ = label(room.occupied(RULE))
     counts = np.bincount(pieces.ravel())
