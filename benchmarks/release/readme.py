@@ -234,7 +234,8 @@ def capture(results: dict[str, Any]) -> list[str]:
     called = ", ".join(f"{prior['name']} {prior['sha256'][:8]}" for prior in priors.values())
     return [
         f"**A real capture** ({results['capture']}: trained on one sweep of phone photos, scored on another; the "
-        f"paper's masks, depth limit {results['depth_limit']:.2f}, {seeds} seed(s), DSDS with "
+        f"paper's masks, convention `{results['rows'][0]['convention']}`, depth limit {results['depth_limit']:.2f}, "
+        f"{seeds} seed(s), DSDS with "
         f"{called}):",
         "",
         *table(head, rows),

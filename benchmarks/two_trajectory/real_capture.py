@@ -4,7 +4,7 @@
 
 A field is fitted to the training sweep, a pseudo-ground-truth field to both. The first is then
 fine-tuned with (a) nothing more, (b) the visibility loss, (c) visibility and DSDS, for the same steps
-from the same seed, and each is scored on the evaluation sweep under the convention ``paper_text``. Writes
+from the same seed, and each is scored on the evaluation sweep under the convention ``proper``. Writes
 ``capture.json`` and ``capture.png``. Fitted fields and renderings are kept in ``--cache``, so that a
 run can be broken off and resumed, and other regularizer settings cost their own fine-tuning only.
 """
@@ -48,7 +48,7 @@ from .scenes import Sweep
 
 WITHOUT_PRIOR = {"field": "(a) fine-tuned alone", "visibility": "(b) + visibility"}
 FIGURE_VIEWS = 4
-CONVENTION = "paper_text"
+CONVENTION = "proper"
 Views = dict[str, NDArray[Any]]
 
 

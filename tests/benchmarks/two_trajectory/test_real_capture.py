@@ -82,7 +82,7 @@ def test_a_run_writes_results_and_a_figure_and_is_resumed_from_its_cache(bench, 
     for row in results["rows"]:
         assert {scores["seed"] for scores in row["per_seed"]} == {0, 1}
         assert 3 < row["psnr_visible"] < 60
-        assert row["convention"] == "paper_text"
+        assert row["convention"] == "proper"
         assert {"psnr", "psnr_common", "ssim", "disparity_mae", "normal_mean_deg", "coverage"} <= set(row)  # README
         assert "lpips" not in row  # there is no network
         assert 0 <= row["coverage"] <= 1
