@@ -19,9 +19,11 @@ class HarvestConfig:
         kinds, shares: kinds of field, and how often each is drawn (relative to their sum). A frequency-encoded
             ``mlp`` is left out by default: it is there to be harvested for evaluation.
         resolutions: cells along an axis of the contracted cube (of the finest level, of half the shortest wavelength).
-        photos, photo_width: how many photos a field sees, and their width in pixels (4:3).
-        observer_photos, observer_width: views of a second sweep and their width in pixels (4:3); only their depth is
-            traced, for the labels: what no photo of either sweep sees is not judged.
+        photos: lowest and highest number of photos that a field sees.
+        photo_width: lowest and highest width of a photo, pixels (4:3).
+        observer_photos: views of a second sweep; only their depth is traced, for the labels: what no photo of either
+            sweep sees is not judged.
+        observer_width: width of those views, pixels (4:3).
         steps: fitting steps, log-uniform; cubes are also taken after ``EARLY`` of them.
         rays: rays a step.
         objects: how many meshes stand in a scene, where there is a folder of them.
@@ -29,8 +31,8 @@ class HarvestConfig:
         voxel_pitch: voxel side in field cells, log-uniform.
         rotated_share: share of cubes with a random rotation.
         room_pitch: voxel side of :func:`room_scene`'s cubes, scene units, log-uniform.
-        fewest_opaque, most_ghosts: a fit has failed, and its scene is given up, if a smaller share of the surface is
-            opaque, or a larger share of what is opaque are ghosts.
+        fewest_opaque: a fit has failed, and its scene is given up, if a smaller share of the surface is opaque.
+        most_ghosts: the same if a larger share of what is opaque are ghosts.
     """
 
     kinds: tuple[str, ...] = ("dense", "hash")

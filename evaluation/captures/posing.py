@@ -23,11 +23,10 @@ class PosingSettings:
 
     Attributes:
         one_lens: all sweeps share one lens (same camera, same zoom and focus); else each has its own.
-        longest_side: features are looked for in photos shrunk to this many pixels.
-        minimum_share: of the photos of each sweep that must get a pose.
-        seed: of COLMAP's random choices; the same again gives the same poses on one thread, and nearly the same on
-            several.
-        threads: 0 for one per core.
+        longest_side: features are looked for in photos shrunk to this many pixels; smaller is faster.
+        minimum_share: share of the photos of each sweep that must get a pose, or it is an error.
+        seed: seed of COLMAP's random choices.
+        threads: 0 for one per core; with 1, the same seed gives the same poses to the last bit, with more, nearly.
     """
 
     one_lens: bool = False

@@ -4,11 +4,18 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
 from ..core.errors import InvalidArgument, MissingExtra
+from ..evaluation.captures.posing import PosingSettings
+from .options import given, options_of
+
+if TYPE_CHECKING:
+    PosingOptions = PosingSettings
+else:
+    PosingOptions = options_of(PosingSettings)
 
 
 def capture(
@@ -16,12 +23,8 @@ def capture(
     evaluation: Positional[Annotated[Path, arg(metavar="EVALUATION")]],
     out: Path,
     frames: int = 100,
-    one_lens: bool = False,
-    longest_side: int = 1600,
-    minimum_share: float = 0.5,
-    seed: int = 0,
-    threads: int = 0,
     plot: Path | None = None,
+    options: Annotated[PosingOptions, arg(name="")] = PosingOptions(),  # noqa: B008 (frozen)
 ) -> None:
     """Make a capture from two videos (or two folders of photos): one to train on, one to be scored on.
 
@@ -33,21 +36,13 @@ def capture(
         evaluation: the same, of another walk through the same scene, to be scored on.
         out: new folder: images, transforms.json (with nerfstudio's file lists), splits.json, capture.json, sparse/0.
         frames: kept of each sweep at most: the sharpest of each of so many equal stretches.
-        one_lens: both were taken with one camera at one zoom; else each sweep has a lens of its own.
-        longest_side: features are looked for in photos shrunk to this many pixels. Smaller is faster.
-        minimum_share: of the frames of each sweep that must get a pose, or it is an error.
-        seed: of COLMAP's random choices.
-        threads: 0 for one per core; with 1, the same seed gives the same poses to the last bit.
         plot: PNG for a bird's-eye view of both sweeps.
     """
     from tqdm import tqdm
 
     from ..evaluation.captures.creation import make_capture
-    from ..evaluation.captures.posing import PosingSettings
 
-    settings = PosingSettings(
-        one_lens=one_lens, longest_side=longest_side, minimum_share=minimum_share, seed=seed, threads=threads
-    )
+    settings = PosingSettings(**given(options))
     if plot is not None:
         _check_plot(plot, "capture")
     bars: dict[str, Any] = {}

@@ -8,11 +8,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, UseAppendAction, arg
 
+from ..cleaning.pipeline import CleanSettings
 from ..core.errors import InvalidArgument
+from .options import given, options_of
 from .prior import Threads
 
 if TYPE_CHECKING:
     from ..cleaning.keep_mask import KeepMask
+
+    CleanOptions = CleanSettings
+else:
+    _ELSEWHERE = "strength", "keep_boxes", "resolution"  # options of the verb itself, with their own spelling
+    _NEEDS_A_FIELD = "field_pitch", "rule", "soft", "skip_empty", "backend", "chunk"
+    CleanOptions = options_of(CleanSettings, leave_out=(*_ELSEWHERE, *_NEEDS_A_FIELD))
 
 Box = tuple[float, float, float, float, float, float]
 
@@ -31,8 +39,11 @@ def clean(
     reach: float | None = None,
     scores_only: bool = False,
     threads: Threads = 0,
+    options: Annotated[CleanOptions, arg(name="")] = CleanOptions(),  # noqa: B008 (frozen)
 ) -> None:
-    """Clean a density grid (.npz: density (X, Y, Z) per scene unit, aabb (2, 3), cubic cells) or 3D Gaussians (.ply).
+    """Clean a density grid (.npz) or 3D Gaussians (.ply); writes a cleaned copy and the mask of what stays.
+
+    A grid file has density (X, Y, Z) per scene unit and aabb (2, 3); its cells are cubes.
 
     Args:
         source: the file to clean; it is not changed.
@@ -66,15 +77,19 @@ def clean(
             f"clean: --resolution, --reach and --scores-only are for splats (.ply); {source.name} is a grid"
         )
     boxes = [[box[:3], box[3:]] for box in keep_box]
-    options: dict[str, Any]
+    settings = given(options)
+    how: dict[str, Any] = {}
     if mask is not None:
-        options = {"mask": KeepMask.load(mask).restored(boxes)}
+        if settings:
+            raise InvalidArgument(f"clean: --mask repeats a cleaning as it was; leave out {', '.join(settings)}")
+        how = {"mask": KeepMask.load(mask).restored(boxes)}
     else:
-        options = {"keep_boxes": tuple(boxes), **_judging(denoiser, threads, strength, cameras)}
-        options |= {"resolution": resolution} if splats else {}
-        options |= {} if reach is None else {"reach": reach}
-    options |= {"scores_only": scores_only} if splats else {}
-    found, density_fn = (_clean_splats if splats else _clean_grid)(source, target, **options)
+        how = {"keep_boxes": tuple(boxes), **_judging(denoiser, threads, strength, cameras)}
+        how |= {"settings": CleanSettings(**settings)} if settings else {}
+        how |= {"resolution": resolution} if splats else {}
+        how |= {} if reach is None else {"reach": reach}
+    how |= {"scores_only": scores_only} if splats else {}
+    found, density_fn = (_clean_splats if splats else _clean_grid)(source, target, **how)
     if preview:
         from .removal_preview import region_table, write_preview
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import NoReturn
 
 from ..core.errors import UnghostError
 
@@ -16,6 +17,54 @@ TRACEBACK = "--traceback"
 DESCRIPTION = f"""Take ghosts out of radiance fields.
 
 An error that you can mend is one line; {TRACEBACK} after any verb shows where it arose."""
+
+# Verb: the module of this package that has the function of that name (imported when the verb is asked for), and what
+# it does, which is the first line of the function's docstring.
+VERBS = {
+    "demo": ("prior", "Clean a synthetic room whose ghosts are known; writes a page to look at and result.json."),
+    "clean": (
+        "cleaning",
+        "Clean a density grid (.npz) or 3D Gaussians (.ply); writes a cleaned copy and the mask of what stays.",
+    ),
+    "masks": ("masks", "Visibility masks of the two-trajectory protocol, from depth and cameras alone."),
+    "doubt": (
+        "uncertainty",
+        "Say which pixels not to trust, by the photos that were trained on; needs renders with depth, but no field.",
+    ),
+    "capture": (
+        "captures",
+        "Make a capture from two videos (or two folders of photos): one to train on, one to be scored on.",
+    ),
+    "convert": (
+        "captures",
+        "Say how hard a capture's evaluation is and, with --out, write it as stock nerfstudio reads it.",
+    ),
+    "evaluate": (
+        "evaluation",
+        "Score anyone's renders against photos: a page, a results file, a table. No field is needed.",
+    ),
+    "report": ("evaluation", "Make the page of a results file: tables by convention, PSNR over coverage, differences."),
+    "bench": ("prior", "Measure how many 32^3 cubes a second a denoiser restores through onnxruntime."),
+    "curate": (
+        "recipes",
+        "Make training pairs from a recipe: cubes of procedural solids, booleans or meshes, and their corruptions.",
+    ),
+    "harvest": ("recipes", "Fit radiance fields to few photos of synthetic scenes; cut out cubes beside the truth."),
+    "preview": (
+        "recipes",
+        "Draw a page of what is in a shard: cubes as surfaces, histograms, statistics, sources and licences.",
+    ),
+    "train": ("training", "Train a restoration prior from shards; writes model.safetensors, logs and checkpoints."),
+    "sample": (
+        "sampling",
+        "Draw unconditional cubes from a diffusion prior; writes them and pictures of them as surfaces.",
+    ),
+    "export": ("training", "Write a trained prior as portable ONNX files, compared with torch before they appear."),
+    "verify": (
+        "training",
+        "State how far an ONNX file is from its checkpoint in torch; exit status 1 if too far for its precision.",
+    ),
+}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -29,43 +78,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         extra: :class:`~unghost.core.errors.UnghostError` and ``OSError``) prints one line, ``unghost VERB: message``,
         to stderr and gives 2. Any other error is raised, and so is every one with ``--traceback``.
     """
-    import tyro
-
-    from . import captures as commands_capture
-    from . import cleaning as commands_clean
-    from . import evaluation as commands_evaluate
-    from . import masks as commands_masks
-    from . import prior as commands
-    from . import recipes as commands_recipes
-    from . import sampling as commands_sample
-    from . import training as commands_prior
-    from . import uncertainty as commands_doubt
-
-    verbs: dict[str, Callable[..., Any]] = {
-        "demo": commands.demo,
-        "clean": commands_clean.clean,
-        "masks": commands_masks.masks,
-        "doubt": commands_doubt.doubt,
-        "capture": commands_capture.capture,
-        "convert": commands_capture.convert,
-        "evaluate": commands_evaluate.evaluate,
-        "report": commands_evaluate.report,
-        "bench": commands.bench,
-        "curate": commands_recipes.curate,
-        "harvest": commands_recipes.harvest,
-        "preview": commands_recipes.preview,
-        "train": commands_prior.train,
-        "sample": commands_sample.sample,
-        "export": commands_prior.export,
-        "verify": commands_prior.verify,
-    }
     given = list(sys.argv[1:] if argv is None else argv)
     words = [word for word in given if word != TRACEBACK]
-    verb = next((word for word in words if word in verbs), "")
+    verb = words[0] if words and words[0] in VERBS else ""
     try:
-        status: int | None = tyro.extras.subcommand_cli_from_dict(
-            verbs, prog="unghost", args=words, description=DESCRIPTION
-        )
+        status = _run(verb, words[1:]) if verb else _overview(words)
     except USER_ERRORS as error:
         if len(words) < len(given):
             raise
@@ -76,6 +93,30 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"unghost {verb}: interrupted", file=sys.stderr)
         return INTERRUPTED_EXIT
     return int(status or 0)
+
+
+def _run(verb: str, words: Sequence[str]) -> int | None:
+    """One verb with its arguments; only its own module is imported."""
+    import tyro
+
+    module = importlib.import_module(f".{VERBS[verb][0]}", __package__)
+    function: Callable[..., int | None] = getattr(module, verb)
+    return tyro.cli(function, prog=f"unghost {verb}", args=words)
+
+
+def _overview(words: Sequence[str]) -> NoReturn:
+    """The help of the whole, or what is wrong with words that start with no verb; either way the process ends."""
+    import tyro
+
+    def named(summary: str) -> Callable[[], None]:
+        def stand_in() -> None: ...
+
+        stand_in.__doc__ = summary
+        return stand_in
+
+    verbs = {verb: named(summary) for verb, (_, summary) in VERBS.items()}
+    tyro.extras.subcommand_cli_from_dict(verbs, prog="unghost", args=words, description=DESCRIPTION)
+    raise SystemExit(USAGE_EXIT)  # no stand-in takes a verb, so this is not reached
 
 
 if __name__ == "__main__":

@@ -6,11 +6,18 @@ Heavy imports wait for the verb.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
 from ..core.errors import InvalidArgument
+from ..data_recipes.harvest.config import HarvestConfig
+from .options import given, options_of
+
+if TYPE_CHECKING:
+    HarvestOptions = HarvestConfig
+else:
+    HarvestOptions = options_of(HarvestConfig, leave_out=("kinds", "shares"))
 
 
 def curate(
@@ -62,9 +69,9 @@ def harvest(
     first: int = 0,
     workers: int = 1,
     fit: bool = True,
-    cubes: int | None = None,
     kinds: tuple[str, ...] = (),
     mesh_root: Path | None = None,
+    options: Annotated[HarvestOptions, arg(name="")] = HarvestOptions(),  # noqa: B008 (frozen)
 ) -> None:
     """Fit radiance fields to few photos of synthetic scenes; cut out cubes beside the truth.
 
@@ -78,18 +85,16 @@ def harvest(
         first: number of the first scene.
         workers: processes, each at a scene of its own.
         fit: fit fields; without it, cubes are of perfect fields with synthetic corruption (quick).
-        cubes: per scene (and snapshot of its field); the default of HarvestConfig if not given.
         kinds: of field, NAME or NAME=SHARE: dense, hash, mlp; dense and hash if not given. mlp is meant to be
             held out: harvest it apart, with another seed, for evaluation.
         mesh_root: a folder of meshes with its manifest.csv; some of its train split stand in the scenes then.
     """
-    from ..data_recipes.harvest.config import HarvestConfig
     from ..data_recipes.harvest.run import harvest as make
 
-    given: dict[str, Any] = {} if cubes is None else {"cubes": cubes}
+    chosen = given(options)
     if kinds:
-        given["kinds"], given["shares"] = zip(*map(_named_share, kinds))
-    config = HarvestConfig(**given)
+        chosen["kinds"], chosen["shares"] = zip(*map(_named_share, kinds))
+    config = HarvestConfig(**chosen)
     pairs = make(
         out,
         scenes=scenes,

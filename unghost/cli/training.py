@@ -5,15 +5,21 @@ from __future__ import annotations
 import dataclasses
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from tyro.conf import Positional, UseAppendAction
+from tyro.conf import Positional, UseAppendAction, arg
 
 from ..core.errors import InvalidArgument, needs_extra
 from ..core.shards.finding import expand_shards
+from .options import given, options_of
+
+with needs_extra("torch", caller="train"):
+    from ..prior.training.config import TrainConfig
 
 if TYPE_CHECKING:
-    from ..prior.training.config import TrainConfig
+    TrainOptions = TrainConfig
+else:
+    TrainOptions = options_of(TrainConfig, leave_out=("network",))
 
 ONLINE_SEED = 1 << 32  # plus the run's seed: what is made online is in no shard
 
@@ -55,7 +61,6 @@ def _configured(file: Path | None, size: str | None, channels: tuple[str, ...], 
     """The configuration of a file, or the default one, with what the command line says in its place."""
     from ..core.io import read_json
     from ..prior.networks.restoration import SIZES, NetworkConfig
-    from ..prior.training.config import TrainConfig
 
     base = TrainConfig() if file is None else TrainConfig.from_dict(read_json(file, caller="train"))
     if size is not None and size not in SIZES:
@@ -76,24 +81,13 @@ def train(
     out: Path,
     validation: UseAppendAction[list[str]] = [],  # noqa: B006 (tyro reads the default, nobody changes it)
     config: Path | None = None,
-    name: str | None = None,
-    steps: int | None = None,
-    max_seconds: float | None = None,
-    batch_size: int | None = None,
-    learning_rate: float | None = None,
-    seed: int | None = None,
-    precision: str | None = None,
-    device: str | None = None,
-    threads: int | None = None,
-    threshold_from: str | None = None,
-    init_from: str | None = None,
     channels: tuple[str, ...] = (),
     size: str | None = None,
-    drop_channels: float | None = None,
     online: UseAppendAction[list[str]] = [],  # noqa: B006
     online_workers: int = 1,
     mesh_root: Path | None = None,
     resume: bool = False,
+    options: Annotated[TrainOptions, arg(name="")] = TrainOptions(),  # noqa: B008 (frozen)
 ) -> None:
     """Train a restoration prior from shards; writes model.safetensors, logs and checkpoints.
 
@@ -101,48 +95,21 @@ def train(
         shards: FOLDER or FOLDER=WEIGHT, a shard or a folder of shards.
         out: folder of the run.
         validation: NAME=FOLDER, held out; may be given several times.
-        config: JSON of a TrainConfig (each run writes its own); the options below override it.
-        name: of the model.
-        steps: optimiser steps.
-        max_seconds: time budget.
-        batch_size: cubes a step.
-        learning_rate: peak.
-        seed: of the weights and of the stream of samples.
-        precision: auto, bf16 or fp32.
-        device: as torch names it.
-        threads: of torch; 0 leaves it alone.
-        threshold_from: validation names (commas between) whose thresholds, averaged, become the model's.
-        init_from: a model.safetensors to start from.
+        config: JSON of a TrainConfig (each run writes its own); the options of a TrainConfig override it.
         channels: what the network sees: signed_opacity, surroundings, view_count, transmittance; the first alone if
             not given.
         size: of the network: xs, s, m or l.
-        drop_channels: share of the cubes of which an optional channel is made unknown.
         online: RECIPE=SHARE, a recipe whose pairs are made while the network trains and fill that share of every
             batch; may be given several times. Its samples are those of a seed apart from all that curate is given.
         online_workers: processes that make them, each recipe's own.
         mesh_root: folder with the meshes and their manifest.csv, for recipes that read meshes.
         resume: go on where a killed run stopped.
     """
-    with needs_extra("torch", caller="train"):
-        from ..prior.training.allocator import keep_freed_memory
-        from ..prior.training.loop import train as run
+    from ..prior.training.allocator import keep_freed_memory
+    from ..prior.training.loop import train as run
 
     keep_freed_memory()
-    given: dict[str, Any] = {
-        "name": name,
-        "steps": steps,
-        "max_seconds": max_seconds,
-        "batch_size": batch_size,
-        "seed": seed,
-        "learning_rate": learning_rate,
-        "precision": precision,
-        "device": device,
-        "threads": threads,
-        "threshold_from": threshold_from,
-        "init_from": init_from,
-        "drop_channels": drop_channels,
-    }
-    chosen = _configured(config, size, channels, given)
+    chosen = _configured(config, size, channels, given(options))
     result = run(
         chosen,
         train_shards=[pair for spec in shards for pair in expand_shards(spec)],

@@ -1,5 +1,6 @@
 import pytest
 
+from unghost import cli
 from unghost.cli import recipes as commands_recipes
 from unghost.data_recipes.harvest import run as module
 
@@ -14,11 +15,11 @@ def configs(monkeypatch):
 
 def test_kinds_and_shares_reach_the_harvest(configs, tmp_path):
     commands_recipes.harvest(tmp_path)
-    commands_recipes.harvest(tmp_path, kinds=("mlp",), cubes=7)
+    assert cli.main(["harvest", "--out", str(tmp_path), "--kinds", "mlp", "--cubes", "7", "--steps", "3", "9"]) == 0
     commands_recipes.harvest(tmp_path, kinds=("dense=1", "hash=2.5"))
     assert configs[0] == module.HarvestConfig()
     assert configs[0].kinds == ("dense", "hash")
-    assert (configs[1].kinds, configs[1].shares, configs[1].cubes) == (("mlp",), (1.0,), 7)
+    assert (configs[1].kinds, configs[1].shares, configs[1].cubes, configs[1].steps) == (("mlp",), (1.0,), 7, (3, 9))
     assert (configs[2].kinds, configs[2].shares) == (("dense", "hash"), (1.0, 2.5))
 
 
