@@ -14,7 +14,7 @@ import signal
 import threading
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import connection
 from types import TracebackType
@@ -26,6 +26,7 @@ Result = TypeVar("Result")
 Task = tuple[Any, ...]
 
 MAX_DEATHS = 3  # of workers over one and the same call
+WATCH_SECONDS = 1.0  # between looks at whether all workers live, while a result is waited for
 
 
 class WorkerDied(UnghostError, ChildProcessError):
@@ -103,10 +104,13 @@ class LocalEngine:
     def _end_pool(self, *, now: bool = False) -> None:
         """``now`` ends calls that are under way, too: after an interrupt nobody waits for them."""
         if self._pool is not None:
-            for process in list((getattr(self._pool, "_processes", None) or {}).values()) if now else ():
+            for process in self._processes() if now else ():
                 process.terminate()
             self._pool.shutdown(wait=True, cancel_futures=True)
             self._pool = None
+
+    def _processes(self) -> list[Any]:
+        return list((getattr(self._pool, "_processes", None) or {}).values())
 
     def _submit(self, call: Callable[..., Result], task: Task) -> Future[Result]:
         if self._pool is None:
@@ -115,6 +119,29 @@ class LocalEngine:
                 self.workers, mp_context=multiprocessing.get_context("spawn"), initializer=_end_with_parent
             )
         return self._pool.submit(call, *task)
+
+    def _result(self, future: Future[Result]) -> Result:
+        """The result of a call that was submitted.
+
+        A pool finds out by itself that a worker died, but for one that is killed in the middle of sending a result:
+        then it waits for the rest, which the other workers' open ends of the pipe never let end.
+        """
+        missed = False
+        while True:
+            wait([future], timeout=WATCH_SECONDS)
+            if future.done():
+                return future.result()
+            dead = any(process.exitcode is not None for process in self._processes())
+            if dead and missed:  # the pool had all the time between two looks
+                break
+            missed = dead
+        for process in self._processes():
+            process.kill()
+            process.join()
+        writer = getattr(getattr(self._pool, "_result_queue", None), "_writer", None)
+        if writer is not None:
+            writer.close()  # the last open end: what the pool waits for ends here
+        raise BrokenProcessPool("a worker died while it sent a result")
 
     def ordered(self, call: Callable[..., Result], tasks: Iterable[Task]) -> Generator[Result, None, None]:
         """See :meth:`Engine.ordered`."""
@@ -132,7 +159,7 @@ class LocalEngine:
             try:
                 for task in itertools.islice(waiting, len(pending), self.ahead if not deaths else 1):
                     pending.append(self._submit(call, task))
-                result = pending[0].result()
+                result = self._result(pending[0])
             except BrokenProcessPool:
                 deaths += 1  # every call under way is lost; alone, the next one shows whether it is to blame
                 self._end_pool()

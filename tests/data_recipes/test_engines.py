@@ -19,7 +19,7 @@ from unghost.data_recipes.recipe import Recipe
 RECIPE = Recipe(parts=(1, 2))
 ROOT = Path(__file__).resolve().parents[2]
 TASKS = """
-    import os, signal, time
+    import os, signal, struct, sys, time
     from pathlib import Path
     from unghost.data_recipes.pairs import make_chunk
 
@@ -39,6 +39,17 @@ TASKS = """
         marker = FOLDER / "died"
         if number == 3 and not marker.exists():
             marker.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return number
+
+    def die_while_sending(number):
+        marker = FOLDER / "died-sending"
+        if number == 3 and not marker.exists():
+            marker.touch()
+            frame = sys._getframe()
+            while "result_queue" not in frame.f_locals:  # of the pool's loop in this worker
+                frame = frame.f_back
+            os.write(frame.f_locals["result_queue"]._writer.fileno(), struct.pack("!i", 1 << 20) + b"the beginning")
             os.kill(os.getpid(), signal.SIGKILL)
         return number
 
@@ -164,6 +175,11 @@ def test_a_worker_that_dies_costs_only_time(engine, tasks, tasks_folder):
     with open_engine(engine, 2) as opened, closing(opened.ordered(tasks.die_once, numbers(12))) as results:
         assert list(results) == list(range(12))
     assert (tasks_folder / "died").exists()
+
+
+def test_a_worker_killed_while_it_sends_its_result_costs_only_time(tasks):
+    with LocalEngine(2) as engine:
+        assert list(engine.ordered(tasks.die_while_sending, numbers(8))) == list(range(8))
 
 
 def test_a_call_that_no_worker_survives_is_named(engine, tasks):
