@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from ..core.errors import InvalidArgument
+from ..core.progress import Bar, progress_bar
 from ..core.shards.storage import read_shard, write_shard
 from .engines import WorkerDied, open_engine, spans
 from .folder_lock import locked
@@ -53,7 +53,7 @@ class _Plan:
             )
         return shard.provenance
 
-    def write(self, chunks: Iterator[Chunk], bar: tqdm[Any]) -> dict[str, Any]:
+    def write(self, chunks: Iterator[Chunk], bar: Bar) -> dict[str, Any]:
         """Collect the shard's chunks and write it; its provenance."""
         arrays: Arrays = {}
         sources: Notes = {}
@@ -168,7 +168,7 @@ def curate(
         if todo:
             with (
                 opened,
-                tqdm(total=count, initial=count - left, unit="cube", disable=not progress, smoothing=0.05) as bar,
+                progress_bar(count, unit="cube", shown=progress, initial=count - left, smoothing=0.05) as bar,
                 closing(opened.ordered(make_chunk, tasks)) as chunks,
             ):
                 try:
@@ -190,7 +190,7 @@ def _check_numbers(**numbers: tuple[int, int]) -> None:
 
 
 def _write(
-    todo: Sequence[_Plan], chunks: Iterator[Chunk], bar: tqdm[Any], made: list[dict[str, Any]], *, wanted: int
+    todo: Sequence[_Plan], chunks: Iterator[Chunk], bar: Bar, made: list[dict[str, Any]], *, wanted: int
 ) -> None:
     """Write the shards of ``todo`` in order, their provenance to ``made``; a full disk says what stays."""
     try:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from ..core.cameras import Cameras
 from ..core.errors import InvalidArgument
+from ..core.progress import progress_bar
 from ..core.ray_distortion import distortion
 from .kinds import TrainableField
 from .rendering import Rendering, Sampling, render_rays
@@ -184,7 +185,7 @@ def train_field(
     _set_stage(field, stages, 0.0)
     optimizer = _optimizer(field)
     errors: list[float] = []
-    bar = _bar(progress, steps)
+    bar = progress_bar(steps, unit="step", describe="fit", shown=progress)
     step = 0
     while (share := done(step)) < 1.0:
         if resampled := _set_stage(field, stages, share):
@@ -211,9 +212,3 @@ def train_field(
     bar.close()
     psnr = float(-10 * np.log10(np.mean(errors[-100:]))) if errors else float("nan")
     return {"steps": step, "seconds": time.perf_counter() - done.start, "psnr": psnr}
-
-
-def _bar(enabled: bool, total: int | None) -> Any:
-    from tqdm import tqdm
-
-    return tqdm(total=total, disable=not enabled, unit="step", desc="fit")

@@ -22,6 +22,7 @@ from ...core.config import to_dict
 from ...core.errors import InvalidArgument, needs_extra
 from ...core.frames import RESOLUTION, cube_lattices, random_rotations
 from ...core.occupancy import DEFAULT_OPACITY_THRESHOLD, opacity_from_density, opacity_from_signed
+from ...core.progress import progress_bar
 from ...core.shards.packing import (
     dequantize_share,
     dequantize_signed,
@@ -281,8 +282,6 @@ def harvest(
         ValueError: numbers out of range, or a scene in ``out`` that is damaged or another harvest's.
         OSError: a scene cannot be written; the finished ones stay. ``BlockingIOError``: another run is at work there.
     """
-    from tqdm import tqdm
-
     folder, config = Path(out), config or HarvestConfig()
     if scenes < 1 or workers < 1:
         raise InvalidArgument(f"harvest: scenes and workers must be >= 1, got {scenes} and {workers}")
@@ -293,7 +292,7 @@ def harvest(
         todo = [i for i in wanted if not finished(folder, seed, i, config, fit=fit, meshes=root is not None)]
         with (
             LocalEngine(workers, ahead=len(todo), apart=True) as engine,
-            tqdm(total=len(todo), disable=not progress, unit="scene") as bar,
+            progress_bar(len(todo), unit="scene", shown=progress) as bar,
             closing(engine.ordered(_work, ((str(folder), seed, i, config, fit, root) for i in todo))) as done,
         ):
             for index, problem in done:

@@ -14,6 +14,7 @@ import torch
 from ...core.errors import InvalidArgument
 from ...core.io import write_text
 from ...core.manifest import Manifest
+from ...core.progress import progress_bar
 from ...core.results import commit, versions
 from ...core.shards.storage import Shard, read_shard
 from ..checkpoint import TorchDenoiser, save_model
@@ -197,11 +198,9 @@ def _run(
     on_step: Callable[[int, Mapping[str, float]], None] | None,
 ) -> str:
     """Step until the budget is used; why it ended."""
-    from tqdm import tqdm
-
     config, group, losses = trainer.config, trainer.group, LossWatch()
-    hidden = not (progress and group.first)
-    bar = tqdm(total=1.0, initial=trainer.progress, disable=hidden, dynamic_ncols=True, bar_format=BAR_FORMAT)
+    shown = progress and group.first
+    bar = progress_bar(1.0, unit="run", initial=trainer.progress, shown=shown, bar_format=BAR_FORMAT)
     begun, carried = time.monotonic(), trainer.elapsed
     first, saved, validated = trainer.step, begun, begun
     batches = blend.stream(trainer.step)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from ..core.errors import InvalidArgument, MissingExtra
+from ..core.progress import StagedProgress
 from ..evaluation.captures.posing import PosingSettings
 from .options import given, options_of
 
@@ -38,27 +39,17 @@ def capture(
         frames: kept of each sweep at most: the sharpest of each of so many equal stretches.
         plot: PNG for a bird's-eye view of both sweeps.
     """
-    from tqdm import tqdm
-
     from ..evaluation.captures.creation import make_capture
 
     settings = PosingSettings(**given(options))
     if plot is not None:
         _check_plot(plot, "capture")
-    bars: dict[str, Any] = {}
+    with StagedProgress("photo", leave=True) as bars:
 
-    def progress(stage: str, done: int, total: int) -> None:
-        if stage not in bars:
-            bars[stage] = tqdm(total=total, desc=stage, unit="pair" if stage == "pairs" else "photo")
-        bars[stage].update(done - bars[stage].n)
-        if done == total:
-            bars[stage].close()
+        def progress(stage: str, done: int, total: int) -> None:
+            bars(done, total, stage=stage, unit="pair" if stage == "pairs" else "photo")
 
-    try:
         told = make_capture(train, evaluation, out, frames=frames, settings=settings, progress=progress)
-    finally:
-        for bar in bars.values():
-            bar.close()
     for sweep in ("train", "eval"):
         each = told[sweep]
         print(f"{sweep}: {each['seen']} pictures in {each['source']}, {each['kept']} kept, {each['posed']} posed")

@@ -10,6 +10,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from ..cleaning.pipeline import CleanSettings
 from ..core.errors import InvalidArgument
+from ..core.progress import StagedProgress
 from .options import given, options_of
 from .prior import Threads
 
@@ -116,7 +117,7 @@ def _judging(denoiser: str, threads: int, strength: float, cameras: Path | None)
         "denoiser": load_denoiser(denoiser, backend="onnx", threads=threads or None),
         "strength": strength,
         "cameras": None if cameras is None else load_cameras(cameras),
-        "progress": _windows(),
+        "progress": StagedProgress("cube"),
     }
 
 
@@ -155,18 +156,3 @@ def _clean_splats(source: Path, target: Path | None, **options: Any) -> tuple[Ke
     gone = int((~found.keep).sum())
     print(f"{gone} of {len(found.keep)} Gaussians ({gone / max(len(found.keep), 1):.1%}) are ghosts")
     return found.mask, found.field.density_fn
-
-
-def _windows() -> Callable[[int, int], None]:
-    """A progress bar of the windows that went through the denoiser, on stderr, gone when it is full."""
-    from tqdm import tqdm
-
-    bar = tqdm(unit="cube", dynamic_ncols=True, leave=False, disable=None)
-
-    def progress(done: int, total: int) -> None:
-        if done < bar.n:  # the next level begins
-            bar.reset()
-        bar.total = total
-        bar.update(done - bar.n)
-
-    return progress

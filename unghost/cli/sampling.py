@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from tyro.conf import Positional
 
 from ..core.errors import InvalidArgument, needs_extra
+from ..core.progress import progress_bar
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -42,7 +43,6 @@ def sample(
     """
     with needs_extra("torch", caller="sample"):
         import torch
-        from tqdm import tqdm
 
         from ..prior.checkpoint import load_model
         from ..prior.diffusion.model import DiffusionNet
@@ -53,7 +53,7 @@ def sample(
             f"sample: {model} is of family {denoiser.manifest.family!r}; only 'diffusion' can be sampled"
         )
     calls = steps * -(-count // max(batch_size, 1))
-    with tqdm(total=calls, unit="step", dynamic_ncols=True) as bar:
+    with progress_bar(calls, unit="step") as bar:
         cubes = sample_cubes(
             denoiser.network,
             count=count,
