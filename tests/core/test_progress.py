@@ -13,10 +13,10 @@ class Terminal(io.StringIO):
 
 
 @pytest.fixture
-def log(monkeypatch):
-    monkeypatch.setattr(sys, "stderr", io.StringIO())
+def log(monkeypatch, capsys):
+    """What stands in a log when every state of a bar is written to it."""
     monkeypatch.setattr(progress, "SECONDS_BETWEEN_LINES", 0.0)
-    return sys.stderr
+    return lambda: capsys.readouterr().err
 
 
 def test_a_log_has_whole_lines_and_no_control_characters(log):
@@ -24,9 +24,10 @@ def test_a_log_has_whole_lines_and_no_control_characters(log):
         for _ in range(4):
             bar.set_postfix_str("loss 1.0", refresh=False)
             bar.update(1)
-    lines = log.getvalue().split("\n")
-    assert "\r" not in log.getvalue()
-    assert "\x1b" not in log.getvalue()
+    text = log()
+    lines = text.split("\n")
+    assert "\r" not in text
+    assert "\x1b" not in text
     assert len(lines) >= 3
     assert lines[-2].startswith("work: 100%|")
     assert lines[-2].endswith("loss 1.0]")
@@ -51,7 +52,7 @@ def test_a_terminal_has_a_bar_that_redraws(monkeypatch):
 def test_nothing_is_shown_unasked(log):
     with progress_bar(4, unit="cube", shown=False) as bar:
         bar.update(4)
-    assert log.getvalue() == ""
+    assert log() == ""
 
 
 def test_stages_have_bars_of_their_own(log):
@@ -60,7 +61,7 @@ def test_stages_have_bars_of_their_own(log):
             for done in range(3):
                 show(done + 1, 3, stage=stage, unit="pair" if stage == "pairs" else None)
         show(1, 5, stage="pairs")  # the count starts again
-    text = log.getvalue()
+    text = log()
     assert "features: 100%" in text
     assert "pairs: 100%" in text
     assert "pairs:  20%" in text

@@ -4,6 +4,7 @@ import shutil
 import numpy as np
 import pytest
 
+from unghost.core import progress
 from unghost.core.occupancy import FREE_LABEL, IGNORE_LABEL, SURFACE_LABEL
 from unghost.core.shards.packing import dequantize_signed, pack_frame, unpack_frame, unpack_labels
 from unghost.core.shards.storage import ARRAYS, read_shard
@@ -140,7 +141,8 @@ def test_exact_solids_come_by_tree_and_alone_as_together(tmp_path):
         np.testing.assert_array_equal(unpack_labels(np.array(shard.labels[index : index + 1]))[0], labels)
 
 
-def test_progress_goes_to_stderr_and_silence_is_the_default(tmp_path, capsys):
+def test_progress_goes_to_stderr_and_silence_is_the_default(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(progress, "SECONDS_BETWEEN_LINES", 0.0)  # the work is quick
     curate(RECIPE, tmp_path / "quiet", count=2, seed=0)
     assert capsys.readouterr() == ("", "")
     curate(RECIPE, tmp_path / "loud", count=2, seed=0, progress=True)

@@ -11,6 +11,7 @@ import textwrap
 import pytest
 import torch
 
+from unghost.core import progress
 from unghost.core.channels import CHANNEL_NAMES
 from unghost.data_recipes.online import OnlinePairs
 from unghost.data_recipes.recipe import load_recipe
@@ -229,6 +230,7 @@ def test_unknown_threshold_shard_and_unreadable_shards(tiny_config, shards, tmp_
 
 def test_works_without_tensorboard_and_shows_a_bar(tiny_config, shards, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    monkeypatch.setattr(progress, "SECONDS_BETWEEN_LINES", 0.0)  # the work is quick
     config = dataclasses.replace(tiny_config, steps=2)
     result = train(config, **(shards | {"progress": True}), out=tmp_path / "run")
     assert result.steps == 2
