@@ -22,11 +22,12 @@ NERFBASELINES_NEEDS := 'numpy<2' opencv-python-headless click tqdm Pillow matplo
 	typing-extensions onnxruntime tyro
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check bench-short clean clean-all demo-setup nerfstudio nerfbaselines
+.PHONY: help setup demo test test-fast check bench-short clean clean-all demo-setup nerfstudio nerfbaselines
 
 help:
 	@echo "make demo       clean a synthetic room with labelled ghosts; writes out/demo/index.html (no torch)"
 	@echo "make test       set up everything, then run the whole test suite"
+	@echo "make test-fast  what takes under half a second of it, in under a minute"
 	@echo "make setup      create .venv with every extra, pinned by constraints.txt"
 	@echo "make check      ruff, formatting, mypy"
 	@echo "make bench-short  the short form of every benchmark that needs no data, into out/short"
@@ -88,7 +89,11 @@ demo: demo-setup
 
 # Two processes of one thread each: most tests are too small to share between threads.
 test: setup $(MADE)/browser
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --durations=20
+
+# Under a minute, while one works; what takes long (examples, trainings, killed processes) is left to `make test`.
+test-fast: setup
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 -m "not slow"
 
 check: setup
 	$(BIN)/ruff check .

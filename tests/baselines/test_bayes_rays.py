@@ -11,6 +11,7 @@ from unghost.fields.training import TrainingConfig, train_field
 SAMPLING = Sampling(near=0.05, middle=2.4, near_samples=48, far_samples=0)
 
 
+@pytest.mark.slow
 def test_color_slopes_are_autograds():
     generator = torch.Generator().manual_seed(0)
     density = torch.rand(5, 7, generator=generator, dtype=torch.float64) * 4
@@ -35,6 +36,7 @@ def trained(photos):
     return field, cameras, images
 
 
+@pytest.mark.slow
 def test_what_photos_look_at_is_surer_than_what_none_sees(trained):
     field, cameras, images = trained
     found = deformation_uncertainty(field, cameras, images, level=4, rays=4096, sampling=SAMPLING)
@@ -46,6 +48,7 @@ def test_what_photos_look_at_is_surer_than_what_none_sees(trained):
     assert found.keep(0.95)(torch.cat([ball, nowhere])).tolist() == [True] * 3 + [False] * 2
 
 
+@pytest.mark.slow
 def test_the_hessian_is_the_change_of_colour_when_a_node_is_moved(trained):
     """Oracle: move one node of the grid, render again, and square the change."""
     field, cameras, _ = trained

@@ -120,6 +120,7 @@ def test_manifest_round_trip(denoiser):
     assert Manifest.from_json(denoiser.manifest.to_json(), origin="test") == denoiser.manifest
 
 
+@pytest.mark.slow
 def test_it_drives_the_regularizer_and_clean(denoiser, kit, aabb, lone_camera):
     field = kit.field(np.pad(np.full((6, 6, 6), 40.0), 5))
     regularizer = DensityRegularizer(denoiser, aabb=aabb, cameras=lone_camera, field_pitch=0.125, cubes=2)

@@ -131,6 +131,7 @@ def test_nobody_counts_for_a_denoiser_that_does_not_ask(crowd):
     assert not viewing_cameras(bent, CHANNEL_NAMES).distortion.any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["numpy_denoiser", "torch_denoiser"])
 def test_cleaning_tells_all_it_knows(kit, aabb, crowd, kind):
     seen, told, alone = (

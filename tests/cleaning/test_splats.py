@@ -65,6 +65,7 @@ def test_the_box_holds_what_hovers_about_the_scene_and_not_the_horizon():
     assert pitch_of(gaussians, box, 10) == pytest.approx((box[1] - box[0]).max() / 10)
 
 
+@pytest.mark.slow
 def test_one_opinion_keeps_or_removes_what_is_in_the_box(scene):
     gaussians = read_splat_ply(scene).gaussians()
     kept = clean_splats(gaussians, denoiser=Constant(1.0), resolution=32)
@@ -76,6 +77,7 @@ def test_one_opinion_keeps_or_removes_what_is_in_the_box(scene):
         clean_splats(gaussians, denoiser=Constant(1.0), resolution=4)
 
 
+@pytest.mark.slow
 def test_the_command_removes_floaters_and_touches_nothing_else(scene, tmp_path, capsys):
     before, target = scene.read_bytes(), tmp_path / "clean.ply"
     words = ["clean", str(scene), "-o", str(target), "--keep", str(tmp_path / "k.npz")]
@@ -97,6 +99,7 @@ def test_the_command_removes_floaters_and_touches_nothing_else(scene, tmp_path, 
     KeepMask.load(tmp_path / "k.npz")
 
 
+@pytest.mark.slow
 def test_a_preview_shows_and_changes_nothing(scene, tmp_path, capsys):
     from matplotlib.image import imread
 
@@ -163,6 +166,7 @@ def test_never_onto_itself_and_nothing_half_written(scene, tmp_path, capsys):
         assert [path.name for path in tmp_path.iterdir()] == ["bad.ply"]
 
 
+@pytest.mark.slow
 def test_scores_alone(scene, tmp_path):
     assert (
         cli.main(

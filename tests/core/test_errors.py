@@ -84,6 +84,7 @@ def bare_raises(source):
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("folder", FOLDERS)
 def test_deliberate_errors_are_of_the_packages_kinds(folder):
     paths = [path for path in (ROOT / folder).rglob("*.py") if not any(parent.is_symlink() for parent in path.parents)]

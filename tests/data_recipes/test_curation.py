@@ -20,6 +20,7 @@ def arrays(folder):
     return {name: np.array(getattr(shard, name)) for name in ARRAYS}
 
 
+@pytest.mark.slow
 def test_same_bytes_for_one_and_two_workers(tmp_path):
     one = curate(RECIPE, tmp_path / "one", count=40, seed=3)
     two = curate(RECIPE, tmp_path / "two", count=40, seed=3, workers=2)
@@ -44,6 +45,7 @@ def test_seeds_and_samples_differ():
     assert not np.array_equal(first, sample_pair(RECIPE, 0, seed=1)[0])
 
 
+@pytest.mark.slow
 def test_shares_of_clean_and_soft_inputs():
     pairs = [sample_pair(RECIPE, index, seed=1) for index in range(150)]
     untouched = [signed for signed, _, severity, _, _ in pairs if severity == 0]

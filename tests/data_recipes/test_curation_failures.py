@@ -30,6 +30,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_killed_run_goes_on_to_the_same_bytes(tmp_path, workers, whole_bytes):
     script, out = tmp_path / "killed.py", tmp_path / "out"

@@ -36,6 +36,7 @@ def test_mesh_pairs_carry_their_mesh_as_group(tmp_path, mesh_root, mesh_recipe):
     assert str(tmp_path) not in str(shard.provenance)  # a shard names no folder of the machine
 
 
+@pytest.mark.slow
 def test_every_mesh_cube_names_its_source(tmp_path, mesh_root, mesh_recipe):
     shard = read_shard(curate(mesh_recipe, tmp_path / "out", count=16, seed=0, mesh_root=mesh_root)[0], verify=True)
     assert shard.provenance["rejected"] == []
@@ -59,6 +60,7 @@ def test_a_cube_can_be_cut_again_from_its_frame(tmp_path, mesh_root, mesh_recipe
     assert filled > 6
 
 
+@pytest.mark.slow
 def test_a_bad_mesh_costs_that_mesh_and_is_reported(tmp_path, mesh_root, whole_bytes, mesh_recipe):
     for name in ("broken.ply", "changed.ply"):
         shutil.copy(mesh_root / "balls/0.ply", mesh_root / name)
@@ -123,6 +125,7 @@ def test_another_mesh_manifest_is_another_curation(tmp_path, mesh_root, mesh_rec
         curate(mesh_recipe, tmp_path / "out", count=4, seed=0, mesh_root=mesh_root)
 
 
+@pytest.mark.slow
 def test_a_recipe_can_have_its_meshes_repaired(tmp_path, mesh_root, mesh_recipe):
     """A ball with a triangle missing: repaired, it is whole again."""
     pytest.importorskip("pymeshlab")

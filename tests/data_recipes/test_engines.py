@@ -177,11 +177,13 @@ def test_a_worker_that_dies_costs_only_time(engine, tasks, tasks_folder):
     assert (tasks_folder / "died").exists()
 
 
+@pytest.mark.slow
 def test_a_worker_killed_while_it_sends_its_result_costs_only_time(tasks):
     with LocalEngine(2) as engine:
         assert list(engine.ordered(tasks.die_while_sending, numbers(8))) == list(range(8))
 
 
+@pytest.mark.slow
 def test_a_call_that_no_worker_survives_is_named(engine, tasks):
     with open_engine(engine, 2) as opened, closing(opened.ordered(tasks.die_of_seven, numbers(9))) as results:
         assert [next(results) for _ in range(7)] == list(range(7))
@@ -189,6 +191,7 @@ def test_a_call_that_no_worker_survives_is_named(engine, tasks):
             next(results)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("victim", [0, 1])
 def test_a_worker_killed_from_outside_costs_only_time(tasks, victim):
     with LocalEngine(2) as opened, closing(opened.ordered(tasks.slowly, numbers(20))) as results:
@@ -234,12 +237,14 @@ def alive(process):
         return False
 
 
+@pytest.mark.slow
 def test_a_recipe_gives_the_same_bytes_on_every_engine(engine, tmp_path):
     here = curate(RECIPE, tmp_path / "here", count=40, seed=5, shard_length=24)
     there = curate(RECIPE, tmp_path / "there", count=40, seed=5, shard_length=24, workers=2, engine=engine)
     assert shard_bytes(here) == shard_bytes(there)
 
 
+@pytest.mark.slow
 def test_a_recipe_whose_worker_is_killed_gives_the_same_bytes(engine, tasks, tasks_folder, tmp_path, monkeypatch):
     here = curate(RECIPE, tmp_path / "here", count=48, seed=5, shard_length=24)
     monkeypatch.setattr(curate_module, "make_chunk", tasks.deadly_chunk)

@@ -51,6 +51,7 @@ def test_a_stream_is_what_a_shard_would_hold(tmp_path):
         np.testing.assert_array_equal(np.concatenate([getattr(b, name) for b in batches]), getattr(shard, name))
 
 
+@pytest.mark.slow
 def test_the_same_for_any_workers_and_any_start():
     one = take(OnlinePairs(RECIPE, seed=2), 6)
     for batch, other in zip(one, take(OnlinePairs(RECIPE, seed=2, workers=2), 6)):
@@ -73,6 +74,7 @@ def test_closing_ends_the_workers_and_nothing_is_written(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_killed_worker_changes_nothing():
     expected = take(OnlinePairs(RECIPE, seed=7), 8)
     with closing(OnlinePairs(RECIPE, seed=7, workers=2).stream(0, 6)) as stream:
@@ -92,6 +94,7 @@ def mesh_root(tmp_path):
     return tmp_path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 2])
 def test_an_error_in_a_worker_names_the_sample(mesh_root, workers):
     recipe = dataclasses.replace(load_recipe("meshes"), cubes_per_mesh=4)
@@ -105,6 +108,7 @@ def test_an_error_in_a_worker_names_the_sample(mesh_root, workers):
     assert multiprocessing.active_children() == []
 
 
+@pytest.mark.slow
 def test_mesh_recipes_run_online(mesh_root):
     recipe = dataclasses.replace(load_recipe("meshes"), cubes_per_mesh=4)
     (batch,) = take(OnlinePairs(recipe, seed=0, workers=2, mesh_root=mesh_root), 1, batch_size=8)

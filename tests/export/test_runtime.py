@@ -52,6 +52,7 @@ def test_empty_batch(denoiser):
     assert denoiser(make_cubes(0), np.zeros(0, np.int64), np.zeros(0, np.float32)).shape == (0, 1, 32, 32, 32)
 
 
+@pytest.mark.slow
 def test_large_batches_are_cut_into_chunks(denoiser):
     cubes, count = make_cubes(CHUNK + 3), CHUNK + 3
     times = np.arange(count) * 999 // count
@@ -79,6 +80,7 @@ def test_views_are_read_and_inputs_left_alone(denoiser):
     assert np.array_equal(found, denoiser(np.ascontiguousarray(turned), 500, 0.1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", [-1.0, 1.0])
 @pytest.mark.parametrize("timestep", [0, 999])
 @pytest.mark.parametrize("edge", [1e-30, 1.0, 1e30])

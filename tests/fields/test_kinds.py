@@ -35,6 +35,7 @@ def random_start(kind, **options):
     return field
 
 
+@pytest.mark.slow
 @every_kind
 def test_each_kind_learns_a_ball_in_a_room(kind, photos):
     cameras, images = photos
@@ -54,6 +55,7 @@ def test_each_kind_learns_a_ball_in_a_room(kind, photos):
     np.testing.assert_array_equal(images, kept)
 
 
+@pytest.mark.slow
 @every_kind
 def test_the_seed_of_the_start_and_of_the_run_decide_and_nothing_else(kind, photos):
     state, probes, field = torch.random.get_rng_state(), [], None
@@ -143,6 +145,7 @@ def test_every_parameter_is_fitted_once_and_has_a_gradient(kind):
         assert parameter.grad.abs().sum() > 0, name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ENCODED)
 def test_what_is_skipped_is_nearly_empty(kind):
     field = random_start(kind)

@@ -72,6 +72,7 @@ def test_a_budget_that_never_ends_is_refused(photos, budget, message):
         train_field(small_field(), *photos, config=QUICK, **budget)
 
 
+@pytest.mark.slow
 def test_a_small_field_learns_a_ball(photos):
     cameras, images = photos
     kept, field = images.copy(), small_field()

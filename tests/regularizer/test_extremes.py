@@ -105,6 +105,7 @@ ELEMENTWISE = {
 }
 
 
+@pytest.mark.slow
 @ANY
 @given(densities(), st.sampled_from(sorted(ELEMENTWISE)))
 def test_rivals_of_single_densities(density, name):
@@ -146,6 +147,7 @@ def test_depth_smoothness(depth, seed):
     assert not depth.grad.isnan().any()
 
 
+@pytest.mark.slow
 @ANY
 @given(densities(cube_shape))
 def test_distortion(edges):
@@ -154,6 +156,7 @@ def test_distortion(edges):
     assert weights.grad is None or not weights.grad.isnan().any()
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     values=densities(st.just((8,))),

@@ -180,6 +180,7 @@ def test_errors():
         ViewCounter(rig)(np.zeros(3))
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_cameras():
     points = np.random.default_rng(5).uniform(BOX[0], BOX[1], (20_000, 3))
     most = []

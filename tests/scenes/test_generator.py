@@ -32,6 +32,7 @@ def test_sweeps_stay_in_free_space_and_in_the_box(seed):
     np.testing.assert_allclose(np.linalg.det(rotation), 1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 4, 9])  # rooms and open floors
 def test_traced_points_lie_on_surfaces(seed):
     scene, poses = furnished(seed)

@@ -159,6 +159,7 @@ def imports_of_the_command_line(source):
     return [name for name in found if "cli" in name.replace("unghost.", ".").strip(".").split(".")[:1]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("folder", [*ALLOWED, "benchmarks", "examples"])
 def test_only_the_command_line_imports_the_command_line(folder):
     for path in sorted((ROOT / folder).rglob("*.py")):

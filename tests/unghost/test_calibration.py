@@ -78,6 +78,7 @@ def test_further_channels_come_from_shards_and_are_unknown_in_recipes(tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_the_three_verbs_take_every_precision(checkpoint, tmp_path, capsys):
     out = tmp_path / "out"
     words = ["export", str(checkpoint), "--precision", "fp32", "fp16", "int8", "--out", str(out)]
@@ -92,6 +93,7 @@ def test_the_three_verbs_take_every_precision(checkpoint, tmp_path, capsys):
         assert f" cubes/s ({precision}, batch 1," in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_an_fp32_file_gives_the_files_of_its_checkpoint(checkpoint, tmp_path):
     words = ["--precision", "fp32", "int8", "--calibration-cubes", "2", "--out"]
     assert cli.main(["export", str(checkpoint), *words, str(tmp_path / "a")]) == 0

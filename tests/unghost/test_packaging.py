@@ -75,6 +75,7 @@ def source(tmp_path_factory):
     return copy
 
 
+@pytest.mark.slow
 def test_the_wheel_holds_every_module(source, tmp_path):
     command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
     done = subprocess.run(

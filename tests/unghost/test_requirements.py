@@ -141,6 +141,7 @@ def test_what_a_folder_imports_is_declared(folder):
     assert not missing, f"no extra for {folder} declares them"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("folder", OUTSIDE)
 def test_what_is_run_with_every_extra_imports_nothing_else(folder):
     allowed = declared([*BASE, *everything("dev"), *everything("scale")]) | set(BROUGHT)
@@ -148,6 +149,7 @@ def test_what_is_run_with_every_extra_imports_nothing_else(folder):
     assert not missing
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("extra", ["base", *ROWS])
 def test_what_is_declared_is_imported(extra):
     folders = PACKAGE if extra == "base" else SERVES[extra]
@@ -155,11 +157,13 @@ def test_what_is_declared_is_imported(extra):
     assert declared(BASE if extra == "base" else EXTRAS[extra]) <= used
 
 
+@pytest.mark.slow
 def test_what_only_developers_need_is_used_outside_the_package():
     used = set().union(*(folder_imports(folder) for folder in OUTSIDE)) | set(NOT_BY_NAME)
     assert declared(EXTRAS["dev"]) - {"unghost"} <= used
 
 
+@pytest.mark.slow
 def test_exceptions_are_in_use():
     """A row that nothing needs any more goes."""
     requirements = declared([*BASE, *everything("dev"), *everything("scale")])

@@ -18,6 +18,7 @@ def test_quaternions_turn_z_to_the_normals():
     np.testing.assert_allclose(turned, normals, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_scene_has_its_share_of_floaters_and_a_row_counts_them(monkeypatch):
     scene = splats.make(900, splats.Options(splats=600, floaters=0.1))
     assert len(scene.kind) == 600

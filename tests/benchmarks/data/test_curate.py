@@ -36,6 +36,7 @@ def test_our_cubes_are_checked_and_a_wrong_one_is_found(bench, monkeypatch):
         bench.check_meshes(1)
 
 
+@pytest.mark.slow
 def test_solids_are_checked_and_wrong_ones_are_found(bench, monkeypatch):
     pytest.importorskip("manifold3d")
     csg = cube_makers.csg
@@ -63,6 +64,7 @@ def test_agreement_by_hand(bench):
     assert bench.agreement(np.packbits(a, axis=1), np.packbits(b, axis=1)) == pytest.approx((1 / 3 + 1) / 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", range(6))
 def test_contenders_make_the_cubes_they_should(bench, number):
     contender = bench.CONTENDERS[number]
@@ -80,6 +82,7 @@ def test_contenders_make_the_cubes_they_should(bench, number):
     assert peak > 10
 
 
+@pytest.mark.slow
 def test_rows_sweeps_and_picture(bench, tmp_path):
     pytest.importorskip("matplotlib")
     options = bench.Options(workers=1, cubes=64, quick=True, out=tmp_path)

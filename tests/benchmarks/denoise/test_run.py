@@ -209,6 +209,7 @@ def test_what_is_timed_of_a_model(parts, tmp_path):
     assert of("x", "shipped", tmp_path).onnx == tmp_path / "shipped.onnx"
 
 
+@pytest.mark.slow
 def test_a_network_without_weights_has_a_speed_and_says_so(parts, monkeypatch):
     monkeypatch.setattr(parts["speed"], "SECONDS", 0.01)
     monkeypatch.setattr(parts["speed"], "BATCH", 1)

@@ -19,6 +19,7 @@ def room():
     return build_room(20)
 
 
+@pytest.mark.slow
 def test_it_holds_what_it_was_given_at_the_centres_and_can_grow_anywhere(room):
     field = GridField(room.true_density, room.pitch)
     cells = field.cells().detach().numpy()
@@ -32,6 +33,7 @@ def test_it_holds_what_it_was_given_at_the_centres_and_can_grow_anywhere(room):
     assert (field.table.grad[:, 0] > 0).sum() >= 400  # where there is nothing, too
 
 
+@pytest.mark.slow
 def test_holes_are_part_of_the_solid_and_leave_most_of_it(room):
     again, solid, missing = torn(20)
     np.testing.assert_array_equal(again.true_density, room.true_density)

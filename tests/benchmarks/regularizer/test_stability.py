@@ -27,6 +27,7 @@ def rows_of(case):
     return [row for row in ROWS if row[:2] == [case.given, case.behaviour]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", STABILITY.CASES, ids=lambda case: case.given)
 def test_hostile_numbers(case):
     """The behaviour of every row in every type, its error, and the error that the document has for it."""

@@ -46,6 +46,7 @@ def test_the_largest_threshold_that_keeps_enough(options, monkeypatch):
         ship.choose(None, options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("half", [False, True])
 def test_the_files_hold_the_threshold_and_agree(options, half, monkeypatch, tmp_path):
     monkeypatch.setattr(ship, "row_of", kept_until(0.1))

@@ -111,6 +111,7 @@ def test_rows_keep_what_is_printed():
     assert compact_rows([row]) == compact_rows(compact_rows([row])) == [expected]
 
 
+@pytest.mark.slow
 def test_the_stored_results_are_compact():
     path = RESULTS / "two_trajectory.json"
     assert path.stat().st_size <= 700_000

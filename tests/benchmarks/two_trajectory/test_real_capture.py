@@ -69,6 +69,7 @@ def _options(bench, capture, tmp_path, **changes):
     return bench.Options(capture=capture, **{**given, **changes})
 
 
+@pytest.mark.slow
 def test_a_run_writes_results_and_a_figure_and_is_resumed_from_its_cache(bench, capture, tmp_path, monkeypatch):
     options = _options(bench, capture, tmp_path)
     bench.run(options)
@@ -122,6 +123,7 @@ def test_the_cache_knows_what_depends_on_whose_code(bench, capture, tmp_path, mo
     assert [method for method in before if before[method] == after[method]] == ["field"]
 
 
+@pytest.mark.slow
 def test_methods_start_from_the_same_field_and_differ(bench, capture, tmp_path):
     strong = ("cubes=2", "visibility_samples=64", "dsds_weight=100.0", "visibility_weight=100.0")
     options = _options(bench, capture, tmp_path, seeds=(0,), finetune_steps=4, settings=strong)
@@ -130,6 +132,7 @@ def test_methods_start_from_the_same_field_and_differ(bench, capture, tmp_path):
     assert rows["dsds"]["psnr_visible"] != rows["visibility"]["psnr_visible"]
 
 
+@pytest.mark.slow
 def test_a_row_for_each_prior(bench, capture, tmp_path):
     options = _options(bench, capture, tmp_path, seeds=(0,), denoisers=("default", "some/views.onnx"))
     assert "--denoisers default views.onnx" in options.command()

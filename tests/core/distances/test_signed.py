@@ -58,6 +58,7 @@ def surface_points(distance, rng, count=4000):
     return (a + b) / 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SOLIDS)
 def test_never_more_than_the_distance_to_any_surface_point(name):
     distance, _ = SOLIDS[name]

@@ -98,6 +98,7 @@ def test_streaks_are_elongated():
     assert ratio("streaks") > 1.5 * ratio("fog_volumes")
 
 
+@pytest.mark.slow
 def test_mean_overlap_falls_as_stated():
     """0.96 at severity 0.1, 0.89 at 0.5, 0.74 at 0.8, 0.6 at 1 (to within 0.03) on the recipe's own cubes."""
     cubes = [sample_cube(np.random.default_rng([5, i]), Recipe())[0] for i in range(150)]
@@ -131,6 +132,7 @@ def test_what_changes_at_a_severity_also_changes_above_it(name, seed, levels, re
     assert not (CORRUPTIONS[name](np.random.default_rng(seed), clean, 0.0) ^ clean).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["corrupt", "soften"])
 def test_the_mix_changes_more_with_severity_on_average(name):
     """For the mix only the average grows: its families' shares of a severity may be drawn anew."""

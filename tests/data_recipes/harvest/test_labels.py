@@ -42,6 +42,7 @@ def labels_one_by_one(photographed, positions, pitch, opaque, hidden, observers)
     return np.array(labels)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pitch", [0.02, 0.06])
 @pytest.mark.parametrize("nodes", [8, 64])
 def test_labels_follow_their_definition(photographed, pitch, nodes):

@@ -40,6 +40,7 @@ TINY = HarvestConfig(
 )
 
 
+@pytest.mark.slow
 def test_one_scene_end_to_end_and_again(tmp_path):
     heard = []
     count = harvest(tmp_path, scenes=1, seed=3, first=5, config=TINY, log=heard.append)
@@ -74,6 +75,7 @@ def first_free(seed):
     raise AssertionError("twenty scenes without a free path")
 
 
+@pytest.mark.slow
 def test_a_scene_depends_on_seed_and_index_alone():
     index, arrays, provenance = first_free(7)
     state = torch.random.get_rng_state()
@@ -113,6 +115,7 @@ def test_cubes_outside_the_box_are_empty_and_ignored(photographed, monkeypatch):
     assert (unpack_labels(arrays["labels"])[outside] == IGNORE_LABEL).all()
 
 
+@pytest.mark.slow
 def test_a_cube_is_stored_with_what_is_about_it(photographed):
     from unghost.fields.kinds import make_field
 
@@ -150,6 +153,7 @@ def check_opacity(field, lattice, opacity, pool):
     assert opacity.max() > 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", harvest_config.KINDS)
 def test_any_kind_of_field_is_harvested(kind, tmp_path):
     config = replace(TINY, kinds=(kind,), shares=(1.0,), steps=(5, 6), cubes=1)
@@ -203,6 +207,7 @@ def test_proposals_prefer_what_is_opaque():
     assert 0.9 < (centers[:, 0] < 0.25).mean() < 0.99
 
 
+@pytest.mark.slow
 def test_room_scenes_repeat_and_fit_a_shard(tmp_path):
     arrays, _ = room_scene(1, 2, TINY)
     again, _ = room_scene(1, 2, TINY)
@@ -224,6 +229,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_a_killed_harvest_goes_on_to_the_same_bytes(tmp_path, whole_bytes):
     script, out = tmp_path / "killed.py", tmp_path / "out"
     script.write_text(KILLED, encoding="utf-8")

@@ -38,6 +38,7 @@ def test_a_full_cube_hides_its_room_and_shows_three_faces():
     assert abs(int(left) - int(right)) > 10
 
 
+@pytest.mark.slow
 def test_a_voxel_lies_where_the_axes_say():
     """x points to the right and towards the eye, y to the right and away, z up."""
     places = {}

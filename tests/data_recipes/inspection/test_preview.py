@@ -45,6 +45,7 @@ def slabs(count):
     return signed, (signed > 0).astype(np.uint8)
 
 
+@pytest.mark.slow
 def test_the_page_holds_everything_and_asks_no_network(pairs, tmp_path):
     path, facts = write_preview(pairs, out=tmp_path / "deep" / "page.html", cubes=4)
     text = path.read_text(encoding="utf-8")
@@ -74,6 +75,7 @@ def test_the_page_holds_everything_and_asks_no_network(pairs, tmp_path):
     assert page.count("svg") == 6
 
 
+@pytest.mark.slow
 def test_the_same_folder_gives_the_same_page(pairs, tmp_path):
     first, _ = write_preview(pairs, out=tmp_path / "a.html", cubes=2, seed=5)
     second, _ = write_preview(pairs, out=tmp_path / "b.html", cubes=2, seed=5)
@@ -95,6 +97,7 @@ def test_share_of_empty_cubes(tmp_path):
     assert "CC0-1.0" in said
 
 
+@pytest.mark.slow
 def test_what_a_shard_says_of_itself_is_only_text(tmp_path):
     signed, labels = slabs(1)
     evil = "<script>alert(1)</script>"
@@ -154,6 +157,7 @@ def test_a_full_disk_leaves_the_page_that_was_there(pairs, tmp_path, monkeypatch
     assert [path.name for path in tmp_path.iterdir()] == ["page.html"]
 
 
+@pytest.mark.slow
 def test_another_set_stands_beside(pairs, tmp_path):
     signed, labels = slabs(3)
     shard_of(tmp_path / "slabs", signed, labels, {})

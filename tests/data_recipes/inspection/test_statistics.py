@@ -159,6 +159,7 @@ def test_opacity_is_compared_over_occupied_voxels():
     assert feature_distances(nothing, nothing)["opacity"] == 0
 
 
+@pytest.mark.slow
 def test_distance_is_a_metric_on_real_cubes():
     sets = [cube_statistics(some_cubes(12, 0, kind)) for kind in (None, "fog_volumes", "salt")]
     table = np.array([[statistics_distance(a, b) for b in sets] for a in sets])
@@ -170,12 +171,14 @@ def test_distance_is_a_metric_on_real_cubes():
         assert table[i, k] <= table[i, j] + table[j, k] + 1e-12
 
 
+@pytest.mark.slow
 def test_more_fog_is_further_away():
     clean = cube_statistics(some_cubes(16, 1))
     near, far = (cube_statistics(some_cubes(16, 1, "fog_volumes", severity)) for severity in (0.1, 1.0))
     assert statistics_distance(clean, near) < statistics_distance(clean, far)
 
 
+@pytest.mark.slow
 def test_the_floor_is_below_the_distance_to_other_cubes():
     clean, foggy = cube_statistics(some_cubes(24, 2)), cube_statistics(some_cubes(24, 2, "blocks", 1.0))
     floor = sampling_floor(clean)

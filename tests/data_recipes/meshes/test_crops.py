@@ -85,6 +85,7 @@ def test_truly_empty_and_near_empty_cubes_are_there(ball):
     assert (counts == 32**3).sum() == 0
 
 
+@pytest.mark.slow
 @pytest.mark.shared_data
 @pytest.mark.skipif(not SHARED.exists(), reason="no data folder beside the project")
 def test_a_thousand_cubes_of_real_meshes_agree_with_the_oracle():

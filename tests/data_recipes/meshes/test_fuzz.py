@@ -51,6 +51,7 @@ def test_any_bytes_behind_a_sound_beginning_end_well(outcome, samples, kind, dat
     outcome(whole[: len(whole) // 2] + data, suffix)
 
 
+@pytest.mark.slow
 @given(st.sampled_from(KINDS), st.lists(st.tuples(st.floats(0, 1), st.integers(0, 255)), min_size=1, max_size=4))
 @settings(max_examples=200, deadline=None)
 def test_changed_bytes_end_well(outcome, samples, kind, changes):
@@ -61,6 +62,7 @@ def test_changed_bytes_end_well(outcome, samples, kind, changes):
     outcome(bytes(data), suffix)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS[:-1])
 def test_a_cut_file_is_never_another_mesh(outcome, samples, kind):
     """At every length: refused, empty, or all of it. (OBJ has no end, so a cut OBJ can be a smaller OBJ.)"""

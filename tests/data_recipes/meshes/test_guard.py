@@ -46,6 +46,7 @@ def folder(tmp_path):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_a_bad_mesh_costs_itself(folder):
     outcomes = list(read_folder(folder))
     assert [(o.path.as_posix(), o.status) for o in outcomes] == [
@@ -65,6 +66,7 @@ def test_a_bad_mesh_costs_itself(folder):
     assert [o.mesh is None for o in outcomes] == [False, True, True, True, False]
 
 
+@pytest.mark.slow
 def test_what_comes_back_is_what_reading_gives(folder):
     here = read_mesh_file(folder / "a.obj")
     with MeshGuard(folder) as guard:
@@ -78,6 +80,7 @@ def test_what_comes_back_is_what_reading_gives(folder):
     assert guard.pid is None
 
 
+@pytest.mark.slow
 def test_named_files_may_be_missing_or_outside(folder):
     (folder / "deep" / "link.obj").symlink_to(folder / "a.obj")
     outcomes = list(read_folder(folder / "deep", ["absent.obj", "../a.obj", folder / "a.obj", "link.obj", "."]))
@@ -89,6 +92,7 @@ def test_named_files_may_be_missing_or_outside(folder):
         MeshGuard(folder / "a.obj")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("limits", "reason"),
     [
@@ -109,6 +113,7 @@ def test_a_file_that_takes_too_long_is_left_and_the_next_one_read(folder, limits
         assert guard.starts == 2
 
 
+@pytest.mark.slow
 def test_a_file_that_needs_too_much_memory_is_rejected(folder):
     """A sound mesh of 1.2 million triangles (86 MB of corners) with 64 MB to read it in."""
     faces = np.zeros(1_200_000, dtype=[("n", "u1"), ("i", "<i4", 3)])
@@ -131,6 +136,7 @@ def test_a_file_that_needs_too_much_memory_is_rejected(folder):
         assert len(guard.read("big.ply").mesh.triangles) == len(faces)
 
 
+@pytest.mark.slow
 def test_a_reader_that_dies_between_files_is_started_again(folder):
     with MeshGuard(folder) as guard:
         assert guard.read("a.obj").status == "loaded"
@@ -139,6 +145,7 @@ def test_a_reader_that_dies_between_files_is_started_again(folder):
         assert guard.starts == 2
 
 
+@pytest.mark.slow
 def test_a_reader_that_crashes_on_a_file_rejects_it(folder):
     (folder / "slow.obj.kept").rename(folder / "aslow.obj")
     with MeshGuard(folder) as guard:
@@ -152,6 +159,7 @@ def test_a_reader_that_crashes_on_a_file_rejects_it(folder):
         assert guard.read("a.obj").status == "loaded"
 
 
+@pytest.mark.slow
 def test_nobody_is_called(folder):
     """A glTF whose buffer and image lie on a server that listens: no connection is made."""
     with socket.create_server(("127.0.0.1", 0)) as server:
@@ -246,6 +254,7 @@ def test_limits_have_ranges(name, value):
         GuardLimits(**{name: value})
 
 
+@pytest.mark.slow
 def test_repair_behind_the_guard(folder):
     pytest.importorskip("pymeshlab")
     (folder / "open.obj").write_text(CUBE + FACES[10:] + "v 9 9 9\n")
@@ -258,6 +267,7 @@ def test_repair_behind_the_guard(folder):
     assert mended.center == pytest.approx([0.5] * 3)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not SHARED.exists(), reason="no data folder beside the project")
 @pytest.mark.shared_data
 def test_every_hostile_file_ends_as_it_should():

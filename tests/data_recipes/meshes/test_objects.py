@@ -62,6 +62,7 @@ def folder(tmp_path):
     return Path(tmp_path)
 
 
+@pytest.mark.slow
 def test_objects_come_from_the_train_split_with_their_sources(folder):
     solids, sources = draw_objects(np.random.default_rng(0), folder, 6)
     assert len(solids) == len(sources) == 6
@@ -71,6 +72,7 @@ def test_objects_come_from_the_train_split_with_their_sources(folder):
         np.testing.assert_array_equal(first.values, second.values)
 
 
+@pytest.mark.slow
 def test_rooms_hold_them_and_say_so(folder):
     config = HarvestConfig(cubes=2, objects=(3, 3))
     with_meshes, told = room_scene(0, 0, config, folder)

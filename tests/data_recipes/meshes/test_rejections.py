@@ -164,6 +164,7 @@ def test_missing_pycollada_names_the_extra(tmp_path, samples):
     assert "MissingExtra: reading .dae needs pycollada: pip install unghost[recipes]" in run.stderr
 
 
+@pytest.mark.slow
 def test_xml_in_bulk_is_refused():
     check_xml(b"<a><b/></a>")
     with pytest.raises(MeshRejected, match="more than 2000000 elements"):

@@ -65,6 +65,7 @@ def test_bent_sheet_and_wedge_at_acute_right_and_obtuse_angles_against_points_on
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("radii", [(0.5, 0.5, 0.5), (0.5, 0.3, 0.125), (0.125, 0.5, 0.125), (1e-3, 1.0, 0.2)])
 def test_ellipsoid_nearest_points_in_and_beside_its_planes_of_symmetry(radii):
     rng = np.random.default_rng(1)

@@ -22,6 +22,7 @@ def both(distance, frame, thickness=1.0, solid=False):
     return shell_in_cube(seen, thickness=thickness, solid=solid), twin(distance, frame, thickness, solid)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solid", [False, True])
 def test_equals_asking_every_voxel_on_composed_objects(solid):
     voxels = differing = 0

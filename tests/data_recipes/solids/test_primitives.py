@@ -25,6 +25,7 @@ def test_family_is_deterministic_finite_and_leaves_positions_alone(name):
     np.testing.assert_array_equal(positions, kept)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FAMILIES)
 def test_solids_have_an_inside_and_an_outside(name):
     axis = (np.arange(48) + 0.5) / 24 - 1.0
@@ -54,6 +55,7 @@ def gradient(solid, points, step=1e-6):
     return np.stack(sides, axis=-1) / (2 * step)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EXACT)
 def test_exact_families_reach_the_surface_and_no_surface_is_nearer(name):
     """Slope 1 almost everywhere; walking the distance down the slope ends on the surface; none of it is nearer."""

@@ -146,6 +146,7 @@ def _colour_count(path, colour):
     return int((pixels == colour).all(axis=-1).sum())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("train", [TRAIN, TRAIN.select([0]), SCORED])
 def test_both_sweeps_are_drawn(tmp_path, train):
     draw_birds_eye(tmp_path / "new" / "plot.png", train, SCORED, title="two sweeps")

@@ -63,6 +63,7 @@ def test_rendered_sweeps_are_posed_together_as_they_were(posed, room):
     assert (folder / "sparse" / "0" / "points3D.ply").stat().st_size > 10 * posing.points
 
 
+@pytest.mark.slow
 def test_progress_counts_to_the_end(posed):
     told = posed[-1]
     assert list(dict.fromkeys(stage for stage, _, _ in told)) == ["features", "pairs", "poses"]
@@ -80,6 +81,7 @@ def test_on_one_thread_a_seed_gives_the_same_poses(posed, tmp_path):
         assert (tmp_path / "again" / name).read_bytes() == (folder / "sparse" / "0" / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_sweeps_of_two_rooms_are_not_joined_and_counted(room, tmp_path):
     sweeps = {
         "train": _save(tmp_path / "in", "a", room.photograph(room.arc([20, 28, 36, 44], 1.0), room.walls(1))),

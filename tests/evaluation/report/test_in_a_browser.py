@@ -36,6 +36,7 @@ def report(tmp_path_factory):
     return folder / "out" / "report.html"
 
 
+@pytest.mark.slow
 def test_everything_arrives_and_nothing_is_fetched(browser, report):
     browser.open(report)
     assert browser.complaints == []
@@ -54,6 +55,7 @@ def test_everything_arrives_and_nothing_is_fetched(browser, report):
     assert min(found["charts"]) > 300
 
 
+@pytest.mark.slow
 def test_the_slider_follows_the_pointer_and_the_arrow_keys(browser, report):
     browser.open(report)
     assert browser.look(CLIP) == "inset(0px 50% 0px 0px)"
@@ -81,6 +83,7 @@ def test_either_side_can_show_any_picture(browser, report):
     assert browser.look(state) == {"left": "photo", "photo": True}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("width", "dark"), [(1400, False), (400, False), (400, True)])
 def test_it_fits_the_screen(browser, report, width, dark, tmp_path):
     browser.open(report, width=width, dark=dark)

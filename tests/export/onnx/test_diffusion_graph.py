@@ -52,6 +52,7 @@ def run(model, inputs):
     return session.run(["x0_pred"], dict(zip(("channels", "timestep", "edge_fraction"), inputs)))[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_graph_equals_torch(name):
     config, operators = CASES[name]
@@ -82,6 +83,7 @@ def test_what_the_unet_adds_to_the_allow_list():
     assert used >= UNET_OPERATORS - OPERATORS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["compact bernoulli", "U-Net x0"])
 def test_export_to_a_file_and_back(name, tmp_path):
     network = lively(CASES[name][0])

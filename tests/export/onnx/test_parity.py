@@ -45,6 +45,7 @@ def test_inputs_of_more_channels():
     assert np.array_equal(full_channel(coarse_channel(about)), about)
 
 
+@pytest.mark.slow
 def test_a_model_of_all_channels_passes_and_is_timed(make_lively, tmp_path):
     network = make_lively(NetworkConfig(channels=CHANNEL_NAMES, widths=(8, 16, 8), condition_width=8))
     save_model(tmp_path / "all.safetensors", network, Manifest(name="all", channels=CHANNEL_NAMES))
@@ -56,6 +57,7 @@ def test_a_model_of_all_channels_passes_and_is_timed(make_lively, tmp_path):
     assert speed["cubes_per_second"] > 0
 
 
+@pytest.mark.slow
 def test_default_architecture_passes(exported):
     report = verify(exported.onnx, exported.checkpoint, cubes=96)
     assert report["cubes"] == 96

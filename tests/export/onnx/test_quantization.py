@@ -56,6 +56,7 @@ def iou(found, expected):
     return float((both / (found | expected).reshape(len(found), -1).sum(1)).mean())
 
 
+@pytest.mark.slow
 def test_files_say_what_they_are(shipped):
     assert [path.name for path in shipped.values()] == ["default.onnx", "default.fp16.onnx", "default.int8.onnx"]
     plain, half, small = (read_manifest(path) for path in shipped.values())
@@ -75,6 +76,7 @@ def test_files_say_what_they_are(shipped):
         )
 
 
+@pytest.mark.slow
 def test_the_same_file_as_the_shipped_one_comes_of_the_shipped_checkpoint(shipped):
     precision = precision_of(read_manifest(WEIGHTS / "default.onnx"))
     assert shipped[precision].read_bytes() == (WEIGHTS / "default.onnx").read_bytes()
@@ -86,6 +88,7 @@ def test_smaller(shipped):
     assert sizes["int8"] < 0.36 * sizes["fp32"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_within_the_stated_tolerance_of_torch(shipped, precision):
     report = verify(shipped[precision], WEIGHTS / "default.safetensors", cubes=48)
@@ -98,6 +101,7 @@ def test_within_the_stated_tolerance_of_torch(shipped, precision):
         assert report["max_error"] < TOLERANCES["fp32"].max_error
 
 
+@pytest.mark.slow
 def test_the_tolerance_of_half_precision_is_not_that_of_single(shipped, tmp_path):
     model = load_model(WEIGHTS / "default.safetensors")
     with torch.no_grad():
@@ -110,6 +114,7 @@ def test_the_tolerance_of_half_precision_is_not_that_of_single(shipped, tmp_path
     assert report["max_error"] > TOLERANCES["fp32"].max_error
 
 
+@pytest.mark.slow
 def test_int8_loses_no_more_than_half_a_percent_of_iou(shipped):
     signed, surface = shells(40, 2)
     scores = {}
@@ -163,6 +168,7 @@ def test_half_weights_are_cast_back(shipped):
     assert all(np.array_equal(stored[name], weights[name]) for name in set(weights) - set(changed))
 
 
+@pytest.mark.slow
 def test_same_inputs_same_bytes_and_nothing_is_logged(exported, precisions, calibration, tmp_path, caplog):
     with caplog.at_level(logging.WARNING):
         for name in ("fp16", "int8"):
@@ -181,6 +187,7 @@ def test_a_result_out_of_tolerance_is_not_written(exported, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_refusals(exported, precisions, calibration, tmp_path):
     for precision in ("fp16", "int8"):
         with pytest.raises(ValueError, match=f"is {precision} already, an fp32 file is needed"):

@@ -113,6 +113,7 @@ def test_no_similarity(wrong):
         transformed_density_fn(abs, wrong)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["callables", "sdf_density", "instant_ngp", "msgpack_stream", "splat_ply", "splats", "nerf_pytorch"]
 )

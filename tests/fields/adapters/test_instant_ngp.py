@@ -162,6 +162,7 @@ def test_foreign(tmp_path, content, rule):
     assert str(path) in str(caught.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("packed", [False, True])
 @pytest.mark.parametrize("share", [0.0, 1e-5, 0.5, 0.99])
 def test_cut_short(tmp_path, packed, share):

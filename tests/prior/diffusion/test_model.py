@@ -110,6 +110,7 @@ def test_draws_flip_as_often_as_they_should():
     assert flipped == pytest.approx(flip_probabilities()[200], abs=5 * 0.5 / 32**1.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("config", EVERY, ids=named)
 @pytest.mark.parametrize("value", [-1.0, 0.0, 1.0, None])
 def test_single_step_is_finite_at_both_ends_of_time(config, value):
@@ -131,6 +132,7 @@ def test_at_the_first_timestep_a_bit_stays_what_it_is(objective):
     assert torch.equal(x0_pred > 0, cubes > 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("config", EVERY, ids=named)
 def test_checkpoint_round_trip(config, tmp_path):
     network = make_network(config)
@@ -168,6 +170,7 @@ def test_denoiser_adds_no_noise_unless_told():
         NoisedDenoiser(TorchDenoiser(RestorationNet(TINY), Manifest(name="r")), torch.Generator())
 
 
+@pytest.mark.slow
 def test_gradient_reaches_every_weight():
     for config in EVERY:
         network = make_network(config)

@@ -67,6 +67,7 @@ def loss_of(trainer, batch):
     return losses.mean().item()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("objective", ["epsilon", "x0", "bernoulli"])
 def test_loss_falls(tiny_config, shard_paths, objective):
     batch = Mixture([(shard_paths["a"], 1.0)], seed=0).batch(0, 6)
@@ -84,6 +85,7 @@ def test_every_step_draws_anew(tiny_config, shard_paths):
     assert abs(losses[0] - losses[1]) > 1e-4
 
 
+@pytest.mark.slow
 def test_unet_trains(tiny_config, shard_paths):
     batch = Mixture([(shard_paths["a"], 1.0)], seed=0).batch(0, 2)
     config = dataclasses.replace(tiny_config, network=TINY_UNET, objective="epsilon", learning_rate=4e-3)
@@ -94,6 +96,7 @@ def test_unet_trains(tiny_config, shard_paths):
     assert loss_of(trainer, batch) < 0.95 * before
 
 
+@pytest.mark.slow
 def test_unet_trains_as_a_restoration_network_too(tiny_config, shard_paths):
     batch = Mixture([(shard_paths["a"], 1.0)], seed=0).batch(0, 2)
     trainer = Trainer(dataclasses.replace(tiny_config, network=TINY_UNET, learning_rate=4e-3))

@@ -96,6 +96,7 @@ def test_more_steps_come_closer_to_the_data():
     assert errors[-1] < 0.005
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("steps", "eta"), [(1000, 1.0), (100, 1.0), (100, 0.0)])
 def test_two_points_keep_their_shares(steps, eta):
     """A voxel that is +1 with probability 0.3."""
@@ -116,6 +117,7 @@ def shares_of(found, patterns):
     return [*same.float().mean(0).tolist(), (~same.any(1)).float().mean().item()]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steps", [1000, 200])
 def test_gaussian_samples_are_whole_patterns(steps):
     """Voxels that depend on one another: no mixtures, and each pattern as often as in the data."""
@@ -135,6 +137,7 @@ def test_bits_of_one_voxel_are_exact_at_any_stride():
         assert (found > 0).float().mean().item() == pytest.approx(0.3, abs=4 * math.sqrt(0.21 / count))
 
 
+@pytest.mark.slow
 def test_bits_are_whole_patterns():
     denoise = patterns_under_flips(PATTERNS, SHARES)
     found = sample_bernoulli(denoise, (1, 4000, 6), ONE, generators=seeded(4))[0]

@@ -213,6 +213,7 @@ def test_all_channels_and_the_labels_move_together(shard_paths):
     assert len(seen) > 15
 
 
+@pytest.mark.slow
 def test_optional_channels_are_dropped_one_by_one(shard_paths):
     mixture = Mixture([(shard_paths["seen"], 1.0)], seed=0, channels=CHANNEL_NAMES, drop_channels=0.3)
     gone = (mixture.batch(0, 300).channels == UNKNOWN).all(axis=(2, 3, 4))

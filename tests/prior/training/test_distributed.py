@@ -207,6 +207,7 @@ def test_alone_nothing_happens(monkeypatch):
     assert not torch.distributed.is_initialized()
 
 
+@pytest.mark.slow
 def test_others_that_never_come_are_not_waited_for_for_ever(monkeypatch):
     settings = {"WORLD_SIZE": "2", "RANK": "1", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port())}
     for name, value in (settings | {TIMEOUT_VARIABLE: "1"}).items():
@@ -218,6 +219,7 @@ def test_others_that_never_come_are_not_waited_for_for_ever(monkeypatch):
         joined("cpu").__enter__()
 
 
+@pytest.mark.slow
 def test_averages_by_hand(tmp_path):
     """Two ranks with gradients 1 and 3, and a loss that is not finite on one of them alone."""
     code = textwrap.dedent(

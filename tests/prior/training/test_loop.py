@@ -100,6 +100,7 @@ def test_resumed_run_has_the_bits_of_one_that_was_not_killed(tiny_config, shards
     assert any(name.startswith("optimizer.0.exp_avg") for name in first)
 
 
+@pytest.mark.slow
 def test_all_channels_and_an_online_recipe_resume_with_the_same_bits(tiny_config, shard_paths, tmp_path):
     network = dataclasses.replace(tiny_config.network, channels=CHANNEL_NAMES)
     config = dataclasses.replace(tiny_config, network=network, steps=4, checkpoint_steps=2, drop_channels=0.3)
@@ -144,6 +145,7 @@ def test_other_seed_gives_other_bits(tiny_config, shards, tmp_path):
     assert not torch.equal(*states)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
 def test_a_killed_process_leaves_a_state_to_go_on_from(tiny_config, shards, tmp_path):
     """SIGKILL right after a step, checkpoints at every step: whatever is on disk is whole."""
@@ -202,6 +204,7 @@ def test_divergence_keeps_the_last_good_checkpoint(tiny_config, shards, tmp_path
     assert not (tmp_path / "run" / "model.safetensors").exists()
 
 
+@pytest.mark.slow
 def test_time_budget_ends_a_run_with_a_decayed_rate(tiny_config, shards, tmp_path):
     rates = []
     config = dataclasses.replace(tiny_config, steps=100_000, max_seconds=0.5, learning_rate=1e-3)

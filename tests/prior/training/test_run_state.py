@@ -125,6 +125,7 @@ def test_bf16_training_runs_and_keeps_fp32_weights(tiny_config, batch):
     assert trainer.network.stem.weight.dtype == torch.float32
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])
 def test_all_channels_train_in_both_precisions(tiny_config, shard_paths, precision):
     network = dataclasses.replace(tiny_config.network, channels=CHANNEL_NAMES)

@@ -28,6 +28,7 @@ def written_model(folder, objective):
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("objective", ["epsilon", "bernoulli"])
 def test_writes_cubes_and_pictures(objective, tmp_path, capsys):
     path, out = written_model(tmp_path, objective), tmp_path / "drawn"

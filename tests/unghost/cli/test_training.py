@@ -54,6 +54,7 @@ def test_a_configuration_file_keeps_its_channels(shard, tmp_path):
     assert json.loads((second / "config.json").read_text())["network"]["channels"] == list(names)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "message"),
     [

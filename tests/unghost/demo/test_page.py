@@ -38,6 +38,7 @@ def test_names_on_the_page_are_only_text(page):
     assert f"The room after {HOSTILE}" in [attributes.get("alt") for _, attributes in reader.tags]
 
 
+@pytest.mark.slow
 @pytest.mark.browser
 @pytest.mark.parametrize(("width", "dark"), [(1400, False), (400, False), (400, True)])
 def test_it_works_in_a_browser(browser, page, width, dark, tmp_path):

@@ -29,6 +29,7 @@ def room():
     return build_room(0)
 
 
+@pytest.mark.slow
 def test_the_room_depends_on_the_seed_alone(room):
     again, other = build_room(0), build_room(1)
     np.testing.assert_array_equal(room.density, again.density)
@@ -38,6 +39,7 @@ def test_the_room_depends_on_the_seed_alone(room):
         build_room(-1)
 
 
+@pytest.mark.slow
 def test_the_density_is_a_fields(room):
     assert room.density.shape == room.ghost_kind.shape == SHAPE
     assert room.density.dtype == np.float32
@@ -104,6 +106,7 @@ def test_the_largest_component_is_what_scipy_says(room):
     assert scores["recall_by_kind"]["touching"] < 0.1 < scores["recall_by_kind"]["detached"]
 
 
+@pytest.mark.slow
 def test_a_whole_run(tmp_path, monkeypatch):
     small = look_at((6.0, -6.0, 4.9), (-0.1, 0.1, 0.72), width=96, height=72, fov_degrees=40.0)
     monkeypatch.setattr(demo_pictures, "CAMERA", small)
@@ -139,6 +142,7 @@ def test_the_renderer_by_hand():
     np.testing.assert_allclose(image[6, 10], PAPER, atol=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not (WEIGHTS / "default.onnx").is_file(), reason="no weights in this checkout yet")
 def test_the_shipped_prior_reaches_the_goal(room):
     from unghost import load_denoiser
