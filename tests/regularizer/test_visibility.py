@@ -7,7 +7,14 @@ import pytest
 from unghost.core.cameras import Cameras
 from unghost.core.frames import random_rotations
 from unghost.regularizer.view_grid import OPEN, ViewGrid, image_rectangles
-from unghost.regularizer.visibility import ViewCounter, camera_sphere, grow_box, ray_points, visibility_points
+from unghost.regularizer.visibility import (
+    SAMPLES_PER_RAY,
+    ViewCounter,
+    camera_sphere,
+    grow_box,
+    ray_points,
+    visibility_points,
+)
 
 BOX = np.array([[-1.0, -1.0, -1.0], [1.0, 2.0, 1.0]])
 
@@ -158,6 +165,18 @@ def test_rays_lie_on_lines_from_the_sphere_through_the_middle():
         assert miss <= np.linalg.norm(BOX[1] - BOX[0]) / 4 + 1e-6
     middle, radius = camera_sphere(rig)
     assert (np.linalg.norm(rig.origins - middle, axis=1) <= radius + 1e-12).all()
+
+
+def test_rays_go_through_the_scene_and_out_again():
+    rig = cameras(1)
+    points = ray_points(np.random.default_rng(0), 64000, cameras=rig, aabb=BOX).reshape(-1, SAMPLES_PER_RAY, 3)
+    along = BOX.mean(axis=0) - rig.origins[0]
+    depth = (points - rig.origins[0]) @ along / (along @ along)  # 1 in the plane of the box's middle
+    enter, leave = depth.min(axis=1), depth.max(axis=1)
+    corners = (np.stack(np.meshgrid(*BOX.T, indexing="ij"), axis=-1) - rig.origins[0]) @ along / (along @ along)
+    assert leave.max() > 1 + 0.6 * (corners.max() - 1)
+    assert np.median(leave) > 1.1
+    assert enter.min() < 1 - 0.5 * min(1.0, 1 - corners.min())
 
 
 def test_one_camera_is_a_sphere_of_no_radius():
