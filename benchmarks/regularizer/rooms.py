@@ -73,7 +73,7 @@ class Options(BenchmarkOptions):
     SHORT: ClassVar[dict[str, Any]] = {
         "rooms": (9,),
         "resolution": 48,
-        "fit_steps": 100,
+        "fit_steps": 250,
         "steps": 3,
         "cubes": 2,
         "points": 20_000,

@@ -88,10 +88,12 @@ class Options(BenchmarkOptions):
 
 
 def chosen_factors(rows: list[dict[str, Any]]) -> dict[str, str]:
-    """Loss -> the name of its factor, by the one rule for all."""
+    """Loss -> the name of its factor, by the one rule for all; none of a loss that left nothing to score."""
     result = {}
     for loss in dict.fromkeys(row["table"] for row in rows):
-        mine = [row for row in rows if row["table"] == loss]
+        mine = [row for row in rows if row["table"] == loss and row["psnr_at_coverage"] is not None]
+        if not mine:
+            continue
         most = max(row["psnr_at_coverage"] for row in mine)
         good = [row for row in mine if row["psnr_at_coverage"] >= most - WITHIN_DB]
         there = f"{loss} {getattr(Weights(), loss):g}"
@@ -140,11 +142,14 @@ def main() -> None:
     rows = [row for row in stored["rows"] if row["table"] not in options.losses] + rows
     best = chosen_factors(rows)
     for row in rows:
-        row["chosen"] = best[row["table"]] == row["method"]
-        say(
-            f"{row['method']}: {row['psnr_at_coverage']:.3f} dB at {row['at_coverage']:.3f}, disparity "
-            f"{row['disparity_mae_at_coverage']:.4f}{' *' * row['chosen']}"
-        )
+        row["chosen"] = best.get(row["table"]) == row["method"]
+        if row["psnr_at_coverage"] is None:
+            say(f"{row['method']}: no pixel that all have, so no score; more --fit-steps leave more")
+        else:
+            say(
+                f"{row['method']}: {row['psnr_at_coverage']:.3f} dB at {row['at_coverage']:.3f}, disparity "
+                f"{row['disparity_mae_at_coverage']:.4f}{' *' * row['chosen']}"
+            )
     command = options.command()
     if options.losses != tuple(FACTORS):
         command = " ; ".join([stored.get("command", ""), *([command] if options.losses else [])])
