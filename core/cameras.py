@@ -204,6 +204,23 @@ class Cameras:
         return counts
 
 
+def look_at(origins: FloatArray, targets: FloatArray) -> FloatArray:
+    """OpenGL camera-to-world ``(N, 3, 4)`` for cameras at ``origins (N, 3)`` facing ``targets (N, 3)``, z up.
+
+    A camera that looks straight up or down has its right along +X.
+
+    Example:
+        >>> look_at(np.array([[2.0, 0.0, 0.0]]), np.zeros((1, 3)))[0, :, 2].tolist()  # backwards
+        [1.0, 0.0, 0.0]
+    """
+    back = origins - targets
+    back /= np.linalg.norm(back, axis=1, keepdims=True)
+    right = np.cross(np.array([0.0, 0.0, 1.0]), back)
+    length = np.linalg.norm(right, axis=1, keepdims=True)
+    right = np.where(length < 1e-9, np.array([1.0, 0.0, 0.0]), right / np.maximum(length, 1e-9))
+    return np.stack([right, np.cross(back, right), back, origins], axis=-1)
+
+
 def warn_if_turned_away(cameras: Cameras | None, aabb: FloatArray, *, caller: str) -> None:
     """Warn if the cameras see next to nothing of a box, and would see it if their y and z axes were turned round.
 

@@ -19,11 +19,10 @@ import numpy as np
 import torch
 
 from unghost import CleanSettings, KeepMask, clean
-from unghost.core.cameras import Cameras
+from unghost.core.cameras import Cameras, look_at
 from unghost.core.occupancy import DEFAULT_OPACITY_THRESHOLD, opacity_from_density
 from unghost.fields.adapters.grids import cell_centers
 from unghost.fields.adapters.nerf_pytorch import NerfPytorchField, load_nerf_pytorch
-from unghost.scenes.generator import look_at
 
 # Half of clean's default. On the three checkpoints that this was tried on (and chosen on), with 30 floaters planted:
 # floater recall / seen cells kept at 0.25 and at 0.5: fern .98/.96 and 1.00/.71, lego .99/1.00 and 1.00/.97,

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from .generator import photograph_again as photograph_again
     from .generator import random_scene as random_scene
     from .volume_renderer import Floats as Floats
-    from .volume_renderer import look_at as look_at
+    from .volume_renderer import camera_at as camera_at
     from .volume_renderer import render as render
     from .volume_renderer import shade as shade
 
@@ -21,6 +21,6 @@ __getattr__, __dir__, __all__ = attach(
     __name__,
     {
         ".generator": ["PhotographedScene", "observers", "photograph", "photograph_again", "random_scene"],
-        ".volume_renderer": ["Floats", "look_at", "render", "shade"],
+        ".volume_renderer": ["Floats", "camera_at", "render", "shade"],
     },
 )

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.cameras import Cameras
+from ..core.cameras import Cameras, look_at
 from ..core.distances.sampled import SampledDistance
 from .furniture import FURNITURE, box_solid, log_uniform, random_texture, sampled_object
 from .solids import Light, Solid, SolidScene
@@ -100,19 +100,6 @@ def random_scene(rng: np.random.Generator, objects: Sequence[SampledDistance] = 
     solids += FURNITURE[int(rng.integers(len(FURNITURE)))](rng, middle, log_uniform(rng, 0.25, 0.6))
     lights = [Light(rng.uniform(-1, 1, size=3) + np.array([0, 0, 1.0]), float(rng.uniform(0.2, 0.6))) for _ in range(2)]
     return SolidScene(solids, lights, float(rng.uniform(0.35, 0.7)), rng.uniform(0.3, 1.0, size=3))
-
-
-def look_at(origins: Array, targets: Array) -> Array:
-    """OpenGL camera-to-world ``(N, 3, 4)`` for cameras at ``origins (N, 3)`` facing ``targets (N, 3)``, z up.
-
-    A camera that looks straight up or down has its right along +X.
-    """
-    back = origins - targets
-    back /= np.linalg.norm(back, axis=1, keepdims=True)
-    right = np.cross(np.array([0.0, 0.0, 1.0]), back)
-    length = np.linalg.norm(right, axis=1, keepdims=True)
-    right = np.where(length < 1e-9, np.array([1.0, 0.0, 0.0]), right / np.maximum(length, 1e-9))
-    return np.stack([right, np.cross(back, right), back, origins], axis=-1)
 
 
 def sweep(rng: np.random.Generator, scene: SolidScene, count: int) -> Array:

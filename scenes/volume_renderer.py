@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.cameras import Cameras
+from ..core.cameras import Cameras, look_at
 from ..core.errors import needs_extra
 from ..core.interpolate import interpolate_grid
 
@@ -26,21 +26,17 @@ class Volume:
     pitch: float
 
 
-def look_at(eye: Any, target: Any, *, width: int, height: int, fov_degrees: float) -> Cameras:
+def camera_at(eye: Any, target: Any, *, width: int, height: int, fov_degrees: float) -> Cameras:
     """One camera at ``eye`` that looks at ``target`` with z up; ``fov_degrees`` is horizontal.
 
     Example:
-        >>> camera = look_at([2.0, 0.0, 0.0], [0.0, 0.0, 0.0], width=8, height=6, fov_degrees=60)
+        >>> camera = camera_at([2.0, 0.0, 0.0], [0.0, 0.0, 0.0], width=8, height=6, fov_degrees=60)
         >>> camera.origins.tolist()
         [[2.0, 0.0, 0.0]]
     """
-    eye, target = np.asarray(eye, dtype=float), np.asarray(target, dtype=float)
-    back = (eye - target) / np.linalg.norm(eye - target)
-    right = np.cross([0.0, 0.0, 1.0], back)
-    right /= np.linalg.norm(right)
-    pose = np.stack([right, np.cross(back, right), back, eye], axis=1)
+    pose = look_at(np.array([eye], dtype=float), np.array([target], dtype=float))
     focal = 0.5 * width / np.tan(np.radians(fov_degrees) / 2)
-    return Cameras.create(pose[None], np.array([focal, focal, width / 2, height / 2]), width, height)
+    return Cameras.create(pose, np.array([focal, focal, width / 2, height / 2]), width, height)
 
 
 def _sunlight(depth: Floats) -> Floats:
@@ -108,7 +104,7 @@ def render(volume: Volume, camera: Cameras, *, steps_per_cell: float = 1.6) -> F
         >>> density = np.zeros((8, 8, 8), np.float32)
         >>> density[2:6, 2:6, 2:6] = 20.0
         >>> volume = shade(density, np.full((8, 8, 8, 3), 0.5, np.float32), aabb, 0.25)
-        >>> picture = render(volume, look_at([4.0, 0.0, 0.0], [0.0, 0.0, 0.0], width=16, height=12, fov_degrees=60))
+        >>> picture = render(volume, camera_at([4.0, 0.0, 0.0], [0.0, 0.0, 0.0], width=16, height=12, fov_degrees=60))
         >>> picture.shape, bool(np.allclose(picture[0, 0], PAPER, atol=1e-6))  # a corner shows the background
         ((12, 16, 3), True)
     """

@@ -5,9 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from unghost.core.cameras import Cameras, distort, largest_radius, undistort, warn_if_turned_away
+from unghost.core.cameras import Cameras, distort, largest_radius, look_at, undistort, warn_if_turned_away
 from unghost.core.frames import random_rotations
-from unghost.scenes.generator import look_at
 
 PHONE = np.array([0.05, -0.08, 0.01, 0.002, 0.0006, -0.0004])
 

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from unghost.core.cameras import Cameras
+from unghost.core.cameras import Cameras, look_at
 from unghost.data_recipes.recipe import load_recipe
 
 _SQUARE_OBJ = "v 0 0 0\nv 2 0 0\nv 2 2 0\nv 0 2 0\nf 1 2 3 4\n"
@@ -144,7 +144,7 @@ def photographed():
         [],
     )
     origins = np.array([[0.95, 0.0, 0.2], [0.9, 0.3, 0.4]])
-    poses = scenes.look_at(origins, np.array([[0.0, 0.0, -0.2]] * 2))
+    poses = look_at(origins, np.array([[0.0, 0.0, -0.2]] * 2))
     cameras = Cameras.create(poses, np.array([24.0, 24.0, 20.0, 15.0]), 40, 30)
     rays = [[ray.reshape(-1, 3) for ray in cameras.rays(index)] for index in range(2)]
     depth = [scene.trace(*ray) * -(ray[1] @ poses[index, :, 2]) for index, ray in enumerate(rays)]

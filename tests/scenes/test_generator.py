@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from unghost.core.cameras import Cameras
+from unghost.core.cameras import Cameras, look_at
 from unghost.scenes.furniture import FURNITURE, random_shape, random_texture
-from unghost.scenes.generator import _small_rotations, look_at, photograph, photograph_again, random_scene, sweep
+from unghost.scenes.generator import _small_rotations, photograph, photograph_again, random_scene, sweep
 from unghost.scenes.solids import PATTERNS, Solid, SolidScene
 
 

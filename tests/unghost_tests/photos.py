@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from unghost.core.cameras import Cameras
-from unghost.scenes.generator import look_at
+from unghost.core.cameras import Cameras, look_at
 from unghost.scenes.solids import Light, Solid, SolidScene, Texture
 
 

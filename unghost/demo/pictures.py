@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from ..core.errors import needs_extra
 from ..core.occupancy import OccupancyRule, opacity_from_density
 from ..scenes.labelled_room.room import AABB, Room
-from ..scenes.volume_renderer import Floats, look_at, render, shade
+from ..scenes.volume_renderer import Floats, camera_at, render, shade
 
 Mask = NDArray[np.bool_]
-CAMERA = look_at((6.0, -6.0, 4.9), (-0.1, 0.1, 0.72), width=800, height=600, fov_degrees=40.0)
+CAMERA = camera_at((6.0, -6.0, 4.9), (-0.1, 0.1, 0.72), width=800, height=600, fov_degrees=40.0)
 REMOVED, MISSED, LOST = (0.98, 0.55, 0.12), (0.50, 0.20, 0.62), (0.85, 0.05, 0.10)
 LABELS = {"clean": "unghost clean", "components": "largest component"}
 

@@ -346,8 +346,7 @@ def test_scenes_are_named_by_what_they_are(bench):
 
 
 def test_unseen_patches_lie_between_the_cameras(bench):
-    from unghost.core.cameras import Cameras
-    from unghost.scenes.generator import look_at
+    from unghost.core.cameras import Cameras, look_at
 
     origins = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     cameras = Cameras.create(look_at(origins, np.zeros((2, 3))), np.array([16.0, 16.0, 12.0, 9.0]), 24, 18)

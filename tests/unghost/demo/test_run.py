@@ -12,7 +12,7 @@ from unghost.demo import run as demo
 from unghost.denoisers import WEIGHTS
 from unghost.scenes.labelled_room.ghosts import COUNTS, KINDS
 from unghost.scenes.labelled_room.room import AABB, FAR, SHAPE, build_room
-from unghost.scenes.volume_renderer import PAPER, Volume, look_at, render
+from unghost.scenes.volume_renderer import PAPER, Volume, camera_at, render
 
 
 class Threshold:
@@ -108,7 +108,7 @@ def test_the_largest_component_is_what_scipy_says(room):
 
 @pytest.mark.slow
 def test_a_whole_run(tmp_path, monkeypatch):
-    small = look_at((6.0, -6.0, 4.9), (-0.1, 0.1, 0.72), width=96, height=72, fov_degrees=40.0)
+    small = camera_at((6.0, -6.0, 4.9), (-0.1, 0.1, 0.72), width=96, height=72, fov_degrees=40.0)
     monkeypatch.setattr(demo_pictures, "CAMERA", small)
     results = demo.run_demo(tmp_path / "out", denoiser=Threshold())
     written = json.loads((tmp_path / "out" / "result.json").read_text(encoding="utf-8"))
@@ -134,7 +134,7 @@ def test_the_renderer_by_hand():
     samples = np.zeros((8, 8, 8, 4), dtype=np.float32)
     samples[:, :, :4] = (0.1, 0.8, 0.2, 9.0)
     box = np.array([[-1.0, -1, -1], [1, 1, 1]])
-    camera = look_at((0.0, -6.0, 0.0), (0.0, 0.0, 0.0), width=21, height=21, fov_degrees=30.0)
+    camera = camera_at((0.0, -6.0, 0.0), (0.0, 0.0, 0.0), width=21, height=21, fov_degrees=30.0)
     image = render(Volume(samples, box, 0.25), camera)
     assert image.shape == (21, 21, 3)
     np.testing.assert_allclose(image[0, 0], PAPER)
