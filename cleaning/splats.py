@@ -32,6 +32,9 @@ class CleanedSplats:
         keep: ``(N,)`` bool.
         mask: the cells, its preview (``mask.summary()``) and undo.
         field: the density that was judged.
+
+    Example: see :func:`unghost.clean_splats`; ``cleaned.keep.mean()`` is the share that stays, and
+    ``cleaned.mask.summary()`` says what goes.
     """
 
     keep_score: NDArray[np.float32]

@@ -63,6 +63,12 @@ class Cameras:
         intrinsics: ``(N, 4)`` fx, fy, cx, cy in pixels.
         width, height: image size in pixels, the same for all.
         distortion: ``(N, 6)`` k1, k2, k3, k4, p1, p2.
+
+    Example:
+        >>> poses = look_at(np.array([[2.0, 0.0, 0.0], [0.0, 2.0, 0.0]]), np.zeros((2, 3)))
+        >>> cameras = Cameras.create(poses, np.array([10.0, 10.0, 8.0, 6.0]), width=16, height=12)
+        >>> cameras.view_count(np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0]])).tolist()  # behind the first, not the other
+        [2, 0]
     """
 
     camera_to_world: FloatArray

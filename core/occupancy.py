@@ -64,6 +64,12 @@ class OccupancyRule:
     Attributes:
         kind: ``"opacity"`` (default; independent of the scene's unit) or ``"density"`` (the paper).
         threshold: opacity in (0, 1), or a density > 0 per scene unit; above it a voxel is occupied.
+
+    Example:
+        >>> OccupancyRule().occupied(np.array([0.0, 1.0, 5.0]), pitch=0.05).tolist()  # opacity over one cell > 0.1
+        [False, False, True]
+        >>> OccupancyRule.paper().occupied(np.array([0.0, 1.0, 5.0]), pitch=0.05).tolist()
+        [False, True, True]
     """
 
     kind: Literal["opacity", "density"] = "opacity"

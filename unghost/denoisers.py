@@ -36,7 +36,12 @@ _LOADERS: dict[str, Callable[[Path, int | None], Denoiser]] = {"onnx": _load_onn
 
 
 def shipped_names() -> list[str]:
-    """Names that :func:`load_denoiser` knows without a path, sorted."""
+    """Names that :func:`load_denoiser` knows without a path, sorted.
+
+    Example:
+        >>> shipped_names()
+        ['default', 'views', 'xs']
+    """
     return sorted({path.stem for suffix in SUFFIXES.values() for path in WEIGHTS.glob(f"*{suffix}")})
 
 

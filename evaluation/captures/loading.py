@@ -45,6 +45,9 @@ class Capture:
             the identity if not normalised).
         scale_factor: ``f`` above: scene units for one unit of the file.
         dropped: photos that were named but not there, and left out as asked.
+
+    Example: see :func:`load_capture`; ``capture.split("eval")`` are the numbers of the photos of a sweep,
+    ``capture.images([3])`` is a photo as ``(1, H, W, 3)`` float32 in [0, 1].
     """
 
     folder: Path
@@ -133,6 +136,19 @@ def load_capture(
             counts them, and stand in ``Capture.dropped``.
         photos: folder that the photos' names refer to, if not ``folder`` (for COLMAP: ``images`` in it).
 
+    Example:
+        >>> import json, tempfile
+        >>> from PIL import Image
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> Image.new("RGB", (64, 48)).save(folder / "walk.png")
+        >>> pose = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]]
+        >>> frame = {"file_path": "walk.png", "transform_matrix": pose}
+        >>> lens = {"fl_x": 60, "fl_y": 60, "cx": 32, "cy": 24, "w": 64, "h": 48}
+        >>> _ = (folder / "transforms.json").write_text(json.dumps({**lens, "frames": [frame]}))
+        >>> capture = load_capture(folder, downscale=4, normalize=False)
+        >>> capture.names, capture.cameras.width, capture.cameras.origins.tolist()
+        (('walk.png',), 16, [[0.0, 0.0, 2.0]])
+
     Raises:
         ValueError: what is wrong with the folder, with ``transforms.json``, the model or the sweeps.
         FileNotFoundError: the folder or photos do not exist (counted, the first ones named).
@@ -168,6 +184,16 @@ def load_cameras(path: str | Path) -> Cameras:
 
     Args:
         path: the file, or a folder that holds one, or a model. It must state ``w`` and ``h`` (for all frames alike).
+
+    Example:
+        >>> import json, tempfile
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> pose = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]]
+        >>> lens = {"fl_x": 60, "fl_y": 60, "cx": 32, "cy": 24, "w": 64, "h": 48}
+        >>> frames = [{"file_path": "a.png", "transform_matrix": pose}]
+        >>> _ = (folder / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
+        >>> load_cameras(folder).origins.tolist()
+        [[0.0, 0.0, 2.0]]
 
     Raises:
         FileNotFoundError: there is none.

@@ -46,6 +46,18 @@ def photo_doubt(
             and still be the same surface, as a share of it; >= 0.
         slack: the same in scene units, on top; two cells of a grid, say.
 
+    Example:
+        >>> from unghost.core.cameras import look_at
+        >>> lens, there = np.array([8.0, 8.0, 2.0, 2.0]), np.zeros((2, 3))
+        >>> cameras = Cameras.create(look_at(np.array([[2.0, 0.0, 0.0], [1.9, 0.4, 0.0]]), there), lens, 4, 4)
+        >>> first, second = cameras.select([0]), cameras.select([1])
+        >>> depth = np.full((1, 4, 4), 2.0)
+        >>> red, blue = (np.tile(np.array(colour), (1, 4, 4, 1)) for colour in ([1.0, 0.0, 0.0], [0.0, 0.0, 1.0]))
+        >>> seen = dict(photos=red, photo_depth=depth, photo_cameras=second, tolerance=0.2)
+        >>> doubt = [float(np.median(photo_doubt(shown, depth, first, **seen))) for shown in (red, blue)]
+        >>> doubt[0] < 0.01 < 0.4 < doubt[1]  # what the photo shows, and what it contradicts
+        True
+
     Returns:
         ``(n, H, W)`` float32 in [0, 1]: the mean absolute difference of colours over the channels and over the photos
         that see the point, divided by the root of one more than the photos in which the point lies on the surface; 1

@@ -86,7 +86,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except USER_ERRORS as error:
         if len(words) < len(given):
             raise
-        message = " ".join(str(error).split()) or type(error).__name__
+        message = " ".join(str(error).split()).removeprefix(f"{verb}: ") or type(error).__name__
         print(f"unghost {verb}: {message}", file=sys.stderr)
         return USAGE_EXIT
     except KeyboardInterrupt:
