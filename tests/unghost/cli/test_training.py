@@ -58,7 +58,7 @@ def test_a_configuration_file_keeps_its_channels(shard, tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--size", "xl"], "unghost train: train: --size must be one of xs, s, m, l, got 'xl'"),
+        (["--size", "xl"], "unghost train: --size must be one of xs, s, m, l, got 'xl'"),
         (["--channels", "view_count"], "NetworkConfig: channels must start with 'signed_opacity'"),
         (["--online", "procedural"], "--online must be RECIPE=SHARE, the share in (0, 1], got 'procedural'"),
         (["--online", "procedural=2"], "--online must be RECIPE=SHARE"),
