@@ -3,8 +3,6 @@
 import io
 import json
 import os
-import subprocess
-import sys
 import zipfile
 
 import numpy as np
@@ -152,16 +150,6 @@ def test_single_precision_that_cannot_tell_corners_apart_is_refused():
     normalise(near + np.float32(1000))  # 2**-14 apart
     with pytest.raises(MeshRejected, match="single precision has 16 steps"):
         normalise(near + np.float32(1e6))  # steps of 1/16
-
-
-def test_missing_pycollada_names_the_extra(tmp_path, samples):
-    (tmp_path / "a.dae").write_text(samples.dae())
-    code = (
-        "from unghost.data_recipes import mesh_collada\nmesh_collada.find_spec = lambda name: None\n"
-        f"mesh_collada.read_dae(open({str(tmp_path / 'a.dae')!r}, 'rb').read())"
-    )
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert "MissingExtra: reading .dae needs pycollada: pip install unghost[recipes]" in run.stderr
 
 
 @pytest.mark.slow
