@@ -69,6 +69,15 @@ def check_xml(data: bytes) -> None:
         raise MeshRejected(f"XML that is cut short or broken ({error})") from error
 
 
+def _parse(data: bytes) -> ElementTree.Element:
+    """The root of checked XML."""
+    check_xml(data)
+    try:
+        return ElementTree.fromstring(data)
+    except ElementTree.ParseError as error:  # names of namespaces that are not declared, say
+        raise MeshRejected(f"XML that is broken ({error})") from None
+
+
 def read_dae(data: bytes) -> Array:
     """Triangles of a COLLADA file's scene, in its unit and with its up axis; polygons of any shape cut.
 
@@ -78,8 +87,7 @@ def read_dae(data: bytes) -> Array:
             name three coordinates, an index out of range, polygons with holes, skinned or spline geometry, or a
             transform that is broken or skews.
     """
-    check_xml(data)
-    root = ElementTree.fromstring(data)
+    root = _parse(data)
     if _name(root) != "COLLADA":
         raise MeshRejected(f"XML of {_name(root)[:40]!r}, not COLLADA")
     try:
@@ -99,9 +107,8 @@ def read_zae(data: bytes) -> Array:
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         documents = [name for name in archive.namelist() if name.lower().endswith(".dae")]
         if "manifest.xml" in archive.namelist():
-            manifest = archive.read("manifest.xml")
-            check_xml(manifest)
-            root = next((e for e in ElementTree.fromstring(manifest).iter() if _name(e) == "dae_root"), None)
+            manifest = _parse(archive.read("manifest.xml"))
+            root = next((element for element in manifest.iter() if _name(element) == "dae_root"), None)
             path = "" if root is None else unquote((root.text or "").strip().split("#", 1)[0])
             documents = [name for name in documents if name == path.removeprefix("./").lstrip("/")]
         if len(documents) != 1:

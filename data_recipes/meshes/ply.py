@@ -262,7 +262,8 @@ def read_ply(data: bytes) -> Array:
     vertex = columns.get("vertex")
     if vertex is None or not {"x", "y", "z"} <= {name for name, (_, lengths) in vertex.items() if lengths is None}:
         raise MeshRejected("a PLY without vertices x, y, z")
-    points = np.stack([np.asarray(vertex[axis][0], dtype=np.float64) for axis in "xyz"], axis=-1)
+    with np.errstate(invalid="ignore"):  # NaN of a kind that signals; whether values are finite is judged later
+        points = np.stack([np.asarray(vertex[axis][0], dtype=np.float64) for axis in "xyz"], axis=-1)
     triangles = triangulate(points, *_corners(columns.get("face", {}), counts.get("face", 0), "faces"))
     if counts.get("tristrips"):
         strips = _split_strips(*_corners(columns["tristrips"], counts["tristrips"], "triangle strips"))

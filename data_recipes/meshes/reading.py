@@ -226,9 +226,10 @@ def trimesh_triangles(data: bytes, file_type: str, sides: dict[str, bytes] | Non
     import trimesh
 
     try:
-        scene: Any = trimesh.load_scene(
-            io.BytesIO(data), file_type=file_type, resolver=sides or {}, process=False, skip_materials=True
-        )
+        with np.errstate(invalid="ignore"):  # whether the values are finite is judged after reading
+            scene: Any = trimesh.load_scene(
+                io.BytesIO(data), file_type=file_type, resolver=sides or {}, process=False, skip_materials=True
+            )
     except (ImportError, MemoryError):
         raise
     except Exception as error:  # readers of a dozen formats raise whatever they like

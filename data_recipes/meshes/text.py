@@ -177,7 +177,8 @@ def read_stl(data: bytes) -> Array:
     """
     announced = int.from_bytes(data[80:84], "little") if len(data) >= 84 else -1
     if announced >= 0 and len(data) == 84 + 50 * announced:
-        return np.frombuffer(data, _STL_FACET, announced, 84)["corners"].astype(np.float64)
+        with np.errstate(invalid="ignore"):  # NaN of a kind that signals; whether values are finite is judged later
+            return np.frombuffer(data, _STL_FACET, announced, 84)["corners"].astype(np.float64)
     start = data[:512].removeprefix(UTF8_MARK).lstrip()[:5].lower()
     if start == b"solid" or data.startswith(UTF16_MARKS):
         return _read_stl_text(decode_text(data))

@@ -151,6 +151,8 @@ def test_nan_matters_where_a_face_uses_it(changed, written):
 @pytest.mark.parametrize(
     ("old", "new", "reason"),
     [
+        ("<vertices id='v'>", "<x:other/><vertices id='v'>", "XML that is broken"),
+        ("<vertices id='v'>", "<other xmlns='a}b'/><vertices id='v'>", "XML that is broken"),
         ("<p>0 1 3 2<", "<p>0 1 3 -1<", "1 face corners name a vertex"),
         ("<p>0 1 3 2<", "<p>0 1 3 4<", "1 face corners name a vertex"),
         ("count='4'", "count='3'", "1 face corners name a vertex"),
