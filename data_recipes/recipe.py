@@ -56,7 +56,7 @@ class Recipe:
         severity: range of the severity of all others, within [0, 1].
         severity_exponent: severity is ``low + (high - low) * u ** exponent``.
         licences: mesh licences that may be used.
-        formats: mesh file endings, those that need no further reader (``dae`` needs pycollada).
+        formats: mesh file endings, without the dot.
         split: the split of the mesh manifest.
         cubes_per_mesh: consecutive samples that share a mesh or boolean tree (so that a worker loads few).
         repair: meshes are repaired before they are cut (``repair.RepairOptions``): small holes closed, faces turned

@@ -2,8 +2,9 @@
 
 A file ends in one of three ways: *loaded* (:func:`read_mesh_file` returns), *empty* (:class:`MeshEmpty`: sound, but
 without a triangle) or *rejected with a reason* (:class:`MeshRejected`). ``docs/hostile_meshes.md`` says which
-kinds of oddity end in which. OBJ, OFF and PLY are read here, to the letter; STL, glTF, GLB and COLLADA are checked
-and counted here and read by trimesh; every other format that the installed trimesh knows is read by it alone.
+kinds of oddity end in which. OBJ, OFF, PLY, STL and COLLADA (also zipped) are read here, to the letter; glTF and GLB
+are checked and counted here and read by trimesh; every other format that the installed trimesh knows is read by it
+alone.
 
 Reading is in this process. A file that may be malicious is read by :mod:`.guard`, in another, with a time and a
 memory limit.
@@ -16,6 +17,7 @@ import io
 import os
 import stat
 import zipfile
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,10 +27,10 @@ from urllib.parse import unquote
 import numpy as np
 
 from ...core.errors import MissingExtra, MissingFile
-from .collada import check_xml, read_dae
+from .collada import check_xml, read_dae, read_zae
 from .gltf import read_glb, read_gltf
 from .ply import read_ply
-from .reading import Array, MeshEmpty, MeshRejected, trimesh_triangles
+from .reading import MOST_TRIANGLES, Array, MeshEmpty, MeshRejected, trimesh_triangles
 from .text import read_obj, read_off, read_stl
 
 if TYPE_CHECKING:
@@ -37,11 +39,10 @@ if TYPE_CHECKING:
 Side = Callable[[str], bytes]
 
 MOST_BYTES = 1 << 29
-MOST_TRIANGLES = 20_000_000
 SMALLEST_AREA = 1e-14  # of a triangle, the longest side of the mesh being 1
 FEWEST_STEPS = 1000  # that single precision must have along the longest side, where the file has no more than that
 
-_ALONE = {"obj": read_obj, "off": read_off, "ply": read_ply, "stl": read_stl, "dae": read_dae}
+_ALONE = {"obj": read_obj, "off": read_off, "ply": read_ply, "stl": read_stl, "dae": read_dae, "zae": read_zae}
 _WITH_SIDES = {"gltf": read_gltf, "glb": read_glb}
 _ZIPPED = frozenset({"3mf", "zae", "3dxml"})
 _LFS = b"version https://git-lfs"
@@ -196,15 +197,15 @@ def _check_precision(soup: Array, extent: float) -> None:
 def _triangles(data: bytes, suffix: str, side: Side) -> Array:
     """Triangles ``(F, 3, 3)`` as the file has them."""
     try:
+        if suffix in _ZIPPED:
+            _check_zip(data)
         if suffix in _ALONE:
             return _ALONE[suffix](data)
         if suffix in _WITH_SIDES:
             return _WITH_SIDES[suffix](data, side)
         if suffix not in known_formats():
             raise MeshRejected(f"the format {suffix[:20]!r} is not read; known: {', '.join(known_formats())}")
-        if suffix in _ZIPPED:
-            _check_zip(data)
-        elif data.lstrip()[:1] == b"<":
+        if suffix not in _ZIPPED and data.lstrip()[:1] == b"<":
             check_xml(data)
         return trimesh_triangles(data, suffix)
     except RecursionError:
@@ -223,7 +224,7 @@ def _check_zip(data: bytes) -> None:
                     raise MeshRejected(f"the archive holds the path {member.filename[:60]!r}")
                 if member.filename.lower().endswith((".xml", ".model", ".dae", ".rels", ".3dxml")):
                     check_xml(archive.read(member))
-    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, OSError) as error:
+    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, OSError) as error:
         raise MeshRejected(f"no whole zip archive ({str(error)[:100]})") from error
 
 

@@ -30,7 +30,10 @@ Json = dict[str, Any]
 
 _ITEM_BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
 _INDEX_TYPES = (5121, 5123, 5125)
-_HARMLESS = re.compile(r"(KHR|EXT|MSFT|ADOBE)_(materials|texture|lights|animation)_\w+|KHR_mesh_quantization|KHR_xmp.*")
+_HARMLESS = re.compile(
+    r"(KHR|EXT|MSFT|ADOBE)_(materials|texture|lights|animation)_\w+|KHR_mesh_quantization|KHR_xmp.*|KHR_node_visibility",
+    re.ASCII,
+)
 _CHUNK_JSON, _CHUNK_BIN = 0x4E4F534A, 0x004E4942
 _DEEPEST = 512
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
@@ -56,8 +59,9 @@ def read_glb(data: bytes, side: Side) -> Array:
             raise MeshRejected(f"GLB chunk {len(chunks)} of {size} bytes reaches beyond the file")
         chunks.append((kind, data[at + 8 : at + 8 + size]))
         at += 8 + size
-    if at != length or not chunks or chunks[0][0] != _CHUNK_JSON or _CHUNK_BIN in [kind for kind, _ in chunks[2:]]:
-        raise MeshRejected("the GLB chunks are not JSON and at most one BIN after it")
+    kinds = [kind for kind, _ in chunks]
+    if at != length or kinds[:1] != [_CHUNK_JSON] or _CHUNK_JSON in kinds[1:] or _CHUNK_BIN in kinds[2:]:
+        raise MeshRejected("the GLB chunks are not one JSON and at most one BIN after it")
     binary = chunks[1][1] if len(chunks) > 1 and chunks[1][0] == _CHUNK_BIN else None
     return _read(chunks[0][1], binary, side)
 
@@ -111,7 +115,7 @@ class _Scene:
             raise MeshRejected("no glTF object with an asset")
         asset = tree["asset"]
         version = str(asset.get("version"))
-        if not re.fullmatch(r"2\.\d+", version) or str(asset.get("minVersion", "2.0")) != "2.0":
+        if not re.fullmatch(r"2\.[0-9]+", version) or str(asset.get("minVersion", "2.0")) != "2.0":
             raise MeshRejected(
                 f"glTF version {version[:20]} (minimum {str(asset.get('minVersion'))[:20]}), 2.0 is read"
             )
@@ -137,7 +141,7 @@ class _Scene:
             return {}, {}, 0
         roots = scenes[_number_of(tree.get("scene", 0), len(scenes), "scene")].get("nodes", [])
         order = self._nodes(roots)
-        place = {old: new for new, old in enumerate(order)}
+        place = {old: new for new, old in enumerate(order)}  # without hidden nodes and what hangs on them
         used = sorted({m for old in order if (m := tree["nodes"][old].get("mesh")) is not None})
         meshes, faces = {}, {}
         for m in used:
@@ -151,7 +155,7 @@ class _Scene:
                 if k in tree["nodes"][old]
             }
             if children := tree["nodes"][old].get("children"):
-                node["children"] = [place[child] for child in children]
+                node["children"] = [place[child] for child in children if child in place]
             if tree["nodes"][old].get("mesh") in kept:
                 node["mesh"] = kept.index(tree["nodes"][old]["mesh"])
             nodes.append(node)
@@ -159,7 +163,7 @@ class _Scene:
         minimal: Json = {
             "asset": {"version": "2.0"},
             "scene": 0,
-            "scenes": [{"nodes": [place[root] for root in roots]}],
+            "scenes": [{"nodes": [place[root] for root in roots if root in place]}],
             "nodes": nodes,
             "meshes": [meshes[m] for m in kept],
             "accessors": [self._accessor(i) for i in self.accessors],
@@ -172,7 +176,7 @@ class _Scene:
         return minimal, {f"{i}": self.buffers[i] for i in numbers}, expected
 
     def _nodes(self, roots: list[Any]) -> list[int]:
-        """The nodes of the scene, parents first; each may be reached once only."""
+        """The nodes that the scene shows, parents first; each may be reached once only."""
         nodes = self.tree.get("nodes", [])
         order: list[int] = []
         level = list(roots)
@@ -184,6 +188,8 @@ class _Scene:
                 if index in seen:
                     raise MeshRejected(f"node {index} is reached twice: the nodes are no trees")
                 seen.add(index)
+                if _is_hidden(nodes[index], index):
+                    continue  # and so is everything below it
                 _check_transform(nodes[index], index)
                 order.append(index)
                 below += nodes[index].get("children", [])
@@ -208,6 +214,7 @@ class _Scene:
             count = self.tree["accessors"][position]["count"]
             if "indices" in primitive:
                 slim["indices"] = self._use(primitive["indices"], points=False)
+                self._check_indices(primitive["indices"])
                 count = self.tree["accessors"][primitive["indices"]]["count"]
             triangles = count // 3 if mode == _TRIANGLES else max(count - 2, 0)
             if mode == _TRIANGLES and count % 3:
@@ -257,6 +264,17 @@ class _Scene:
         if start + length > len(self.buffers[buffer]):
             raise MeshRejected(f"buffer view {number} reaches beyond its buffer of {len(self.buffers[buffer])} bytes")
 
+    def _check_indices(self, index: int) -> None:
+        """Check that no index is the largest of its type: forbidden, as some programs start a strip anew there."""
+        accessor = self.tree["accessors"][index]
+        view = self.tree["bufferViews"][accessor["bufferView"]]
+        dtype = np.dtype(f"<u{_ITEM_BYTES[accessor['componentType']]}")
+        start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+        stride, count = view.get("byteStride", dtype.itemsize), accessor["count"]
+        values = np.ndarray((count,), dtype, self.buffers[view["buffer"]], start, (stride,)) if count else np.zeros(0)
+        if (restarts := int((values == np.iinfo(dtype).max).sum())) > 0:
+            raise MeshRejected(f"accessor {index} has {restarts} indices of {np.iinfo(dtype).max}, primitive restart")
+
     def _bytes(self, buffer: Json, number: int) -> bytes:
         """The bytes of a buffer: of the GLB's chunk, a data URI, or a file beside the glTF."""
         length = _number_of(buffer["byteLength"], 1 << 40, "a byte length")
@@ -286,6 +304,16 @@ class _Scene:
     def _view(self, index: int) -> Json:
         view = self.tree["bufferViews"][index]
         return {k: view[k] for k in ("buffer", "byteLength", "byteOffset", "byteStride") if k in view}
+
+
+def _is_hidden(node: Json, index: int) -> bool:
+    """Whether KHR_node_visibility hides a node with all its children."""
+    visible = node.get("extensions", {}).get("KHR_node_visibility", {}).get("visible", True)
+    if not isinstance(visible, bool):
+        raise MeshRejected(
+            f"node {index}: visible (KHR_node_visibility) must be true or false, got {str(visible)[:40]}"
+        )
+    return not visible
 
 
 def _check_transform(node: Json, index: int) -> None:

@@ -35,8 +35,8 @@ from typing import Any
 import numpy as np
 
 from ...core.errors import InvalidArgument, MissingExtra
-from .files import MOST_TRIANGLES, MeshFile, mesh_suffixes
-from .reading import Array
+from .files import MeshFile, mesh_suffixes
+from .reading import MOST_TRIANGLES, Array
 from .repair import RepairOptions
 
 LOADED, EMPTY, REJECTED = "loaded", "empty", "rejected"

@@ -7,6 +7,7 @@ with the transforms of scene nodes applied; ``(0, 3, 3)`` where a sound file has
 from __future__ import annotations
 
 import io
+import re
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,11 @@ from ...core.errors import InvalidFile, MissingExtra
 
 Array = NDArray[Any]
 
-_MARKS = ((b"\xef\xbb\xbf", "utf-8-sig"), (b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16"))
+UTF8_MARK = b"\xef\xbb\xbf"
+UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")
+_MARKS = ((UTF8_MARK, "utf-8-sig"), *((mark, "utf-16") for mark in UTF16_MARKS))
+_NO_NUMBER = re.compile(r"[^\t-\r !-^`-~]")  # anything but plain ASCII, and the underscore
+MOST_TRIANGLES = 20_000_000  # of a file
 MOST_CORNERS = 20_000  # of a concave polygon: cut in less than a second, or in some seconds if it crosses itself
 _FLATTEST = 1e-9  # smallest singular value over the largest of a node's transform
 
@@ -50,6 +55,57 @@ def decode_text(data: bytes) -> str:
     if "\0" in text:
         raise MeshRejected("NUL characters in a text file")
     return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def number_words(text: str) -> list[str]:
+    """Split text at white space into words that ``int`` and ``float`` read as file formats mean them.
+
+    Raises:
+        ValueError: an underscore, or anything but plain ASCII: Python takes ``1_0``, digits of any script, and white
+            space of any script between them.
+    """
+    if _NO_NUMBER.search(text):
+        raise InvalidFile(f"no plain numbers: {text.strip()[:60]!r}")
+    return text.split()
+
+
+def whole_numbers(text: str) -> Array:
+    """The whole numbers of a text, ``(N,)`` int64.
+
+    Raises:
+        ValueError: a word that is none, or one of more than 64 bits.
+    """
+    try:
+        return np.array([int(word) for word in number_words(text)], dtype=np.int64)
+    except OverflowError:
+        raise InvalidFile(f"a number of more than 64 bits: {text.strip()[:60]!r}") from None
+
+
+def decimal_numbers(text: str) -> Array:
+    """The numbers of a text, ``(N,)`` float64; NaN and infinity are numbers, which no face may use.
+
+    Raises:
+        ValueError: a word that is none.
+    """
+    return np.array([float(word) for word in number_words(text)], dtype=np.float64)
+
+
+def strip_corners(corners: Array, lengths: Array) -> Array:
+    """Corners ``(3 T,)`` of the triangles of strips, every second one turned round, so that all face the same way.
+
+    Args:
+        corners: ``(lengths.sum(),)``, the strips' vertex numbers one after the other.
+        lengths: ``(S,)``, the corners of each strip.
+
+    Raises:
+        MeshRejected: a strip of fewer than three corners.
+    """
+    if len(lengths) and lengths.min() < 3:
+        raise MeshRejected(f"a strip of {int(lengths.min())} corners")
+    first = np.repeat(np.cumsum(lengths) - lengths, lengths - 2)
+    step = np.arange(len(first)) - np.repeat(np.cumsum(lengths - 2) - (lengths - 2), lengths - 2)
+    odd, first = step % 2, first + step
+    return np.stack([corners[first], corners[first + 1 + odd], corners[first + 2 - odd]], axis=-1).ravel()
 
 
 def triangulate(vertices: Array, counts: Array, corners: Array) -> Array:
@@ -170,9 +226,10 @@ def trimesh_triangles(data: bytes, file_type: str, sides: dict[str, bytes] | Non
     import trimesh
 
     try:
-        scene: Any = trimesh.load_scene(
-            io.BytesIO(data), file_type=file_type, resolver=sides or {}, process=False, skip_materials=True
-        )
+        with np.errstate(invalid="ignore"):  # whether the values are finite is judged after reading
+            scene: Any = trimesh.load_scene(
+                io.BytesIO(data), file_type=file_type, resolver=sides or {}, process=False, skip_materials=True
+            )
     except (ImportError, MemoryError):
         raise
     except Exception as error:  # readers of a dozen formats raise whatever they like
@@ -182,12 +239,22 @@ def trimesh_triangles(data: bytes, file_type: str, sides: dict[str, bytes] | Non
         matrix, name = scene.graph.get(node)
         geometry = scene.geometry[name]
         if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
-            soup.append(_place(np.asarray(geometry.vertices, dtype=np.float64), geometry.faces, matrix, str(node)))
+            soup.append(place(np.asarray(geometry.vertices, dtype=np.float64), geometry.faces, matrix, str(node)))
     return np.concatenate(soup) if soup else no_triangles()
 
 
-def _place(vertices: Array, faces: Array, matrix: Array, node: str) -> Array:
-    """Triangles ``(F, 3, 3)`` of one node in the scene's frame."""
+def place(vertices: Array, faces: Array, matrix: Array, node: str) -> Array:
+    """Triangles ``(F, 3, 3)`` of one node in the scene's frame.
+
+    Args:
+        vertices: ``(V, 3)``, in the node's frame.
+        faces: ``(F, 3)``, F > 0.
+        matrix: ``(4, 4)``, from the node's frame to the scene's.
+        node: its name, for the message.
+
+    Raises:
+        MeshRejected: a face names a vertex that is not there, or the matrix is not finite or flattens the mesh.
+    """
     faces, matrix = np.asarray(faces), np.asarray(matrix, dtype=np.float64)
     if not np.isfinite(matrix).all():
         raise MeshRejected(f"the transform of node {node[:80]!r} is not finite")

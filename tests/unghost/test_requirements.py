@@ -55,12 +55,10 @@ NAMES = {  # distribution -> the name it is imported by, where they differ
     "pillow": "PIL",
     "scikit-image": "skimage",
     "open3d-cpu": "open3d",
-    "pycollada": "collada",
     "pytest-xdist": "xdist",
 }
 NOT_BY_NAME = {  # declared, and used without an import statement
     "av": "imported by evaluation/captures/frames.py through a list of names",
-    "collada": "trimesh reads COLLADA with it",
     "tensorboard": "behind torch.utils.tensorboard",
     "xdist": "pytest -n",
     "ruff": "make check",

@@ -283,7 +283,6 @@ def test_what_no_scene_shows_does_not_matter(written, samples):
 
 
 def test_collada_keeps_its_geometry_without_its_materials(written, samples):
-    pytest.importorskip("collada")
     bound = "<instance_geometry url='#g'><bind_material><technique_common><instance_material symbol='m' target='#no'/>"
     bound += "</technique_common></bind_material></instance_geometry>"
     moved = f"<node><translate>0 3 0</translate>{bound}</node><node>{bound}</node>"

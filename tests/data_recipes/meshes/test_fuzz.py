@@ -25,8 +25,6 @@ def outcome(tmp_path_factory, area):
             read, reason = read_mesh_file(path), ""
         except (MeshEmpty, MeshRejected) as error:
             read, reason = None, str(error)
-        except ImportError as error:
-            read, reason = None, str(error) if "pycollada" in str(error) else ""
         if read is None:
             assert reason
             return None
@@ -68,8 +66,7 @@ def test_a_cut_file_is_never_another_mesh(outcome, samples, kind):
     """At every length: refused, empty, or all of it. (OBJ has no end, so a cut OBJ can be a smaller OBJ.)"""
     suffix, whole = samples.valid[kind]
     full = outcome(whole, suffix)
-    if full is None:
-        pytest.skip("needs pycollada")
+    assert full is not None
     for length in range(len(whole)):
         read = outcome(whole[:length], suffix)
         assert read is None or np.array_equal(read.triangles, full.triangles), f"{length} of {len(whole)} bytes"
