@@ -1,9 +1,12 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
 
 from unghost.splats.ply import KEEP_SCORE, Gaussians, read_splat_ply, write_splat_ply
 
+SHARED = Path(__file__).resolve().parents[3] / "shared" / "data" / "splats"
 NAMES = [
     "x",
     "y",
@@ -324,3 +327,20 @@ def test_the_box_does_not_care_for_what_is_transparent():
     logits = np.repeat([3.0, -20.0], 500)
     box = Gaussians.create(means, np.full((1000, 3), 0.01), [[1, 0, 0, 0]] * 1000, logits).aabb()
     assert (box < 1.1).all()
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="the shared data folder is absent")
+@pytest.mark.shared_data
+def test_files_of_other_programs(tmp_path):
+    """Every .ply that is not compressed is read to its last row and given back; every other file is named."""
+    files = [path for path in sorted(SHARED.rglob("*")) if path.suffix in (".ply", ".splat", ".spz", ".sog")]
+    assert len(files) >= 10
+    for path in files:
+        if path.suffix == ".ply" and ".compressed" not in path.name:
+            splats = read_splat_ply(path)
+            assert splats.gaussians().valid.all()
+            write_splat_ply(tmp_path / "all.ply", splats, keep=np.ones(len(splats), bool))
+            assert (tmp_path / "all.ply").read_bytes() == path.read_bytes()
+        else:
+            with pytest.raises(ValueError, match=r"is a compressed splat file .*: convert it"):
+                read_splat_ply(path)
