@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import zipfile
+import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..core.aabb import as_aabb
 from ..core.arrays import is_tensor, to_numpy
 from ..core.errors import InvalidArgument, InvalidFile
+from ..core.file_kinds import KEEP_MASK, file_kind
 from ..core.io import write_npz
 from ..core.lattice import cells_within, lattice_axes, lattice_origin, look_up_cells
 from ..core.occupancy import check_density_shape
@@ -171,8 +173,10 @@ class KeepMask:
                 manifest, packed = json.loads(archive["manifest"].tobytes().decode()), archive["cells"]
         except FileNotFoundError:
             raise
-        except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as error:
-            raise InvalidFile(f"KeepMask.load: {source} is not a keep mask, or is truncated ({error})") from None
+        except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile, zlib.error):
+            kind = file_kind(source, caller="KeepMask.load")
+            about = f"it is {kind.name}" if kind is not KEEP_MASK else "an array cannot be read"
+            raise InvalidFile(f"KeepMask.load: {source} is not a keep mask, or is truncated ({about})") from None
         if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
             raise InvalidFile(f"KeepMask.load: {source} is not a keep mask (format must be {FORMAT!r})")
         if manifest.get("format_version") != FORMAT_VERSION:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -59,7 +60,7 @@ class CleanSettings:
             that hold something and around those; 1 asks everywhere. What is thinner than a block and on its own may
             then be missed: it stays.
         drop_invalid: show NaN, infinite and negative densities as empty, leave their cells alone and count those met,
-            instead of raising.
+            instead of raising. Of splats: remove those with such values, which else stay unjudged.
         backend: what the callable takes, ``"numpy"`` or ``"torch"``; None to find out.
         chunk: most positions handed to the callable at once.
 
@@ -139,7 +140,7 @@ def clean(
         aabb: ``(2, 3)`` scene units: where to clean; the rest is left as it is.
         denoiser: kind ``"numpy"`` or ``"torch"``. One that asks for the surroundings gets them from the same grid.
         cameras: of the training photos, for a denoiser that asks who sees a cell (view counts, transmittances);
-            without them that is unknown.
+            without them that is unknown. A warning is raised if the denoiser does not ask.
         settings: see :class:`CleanSettings`; ``overrides`` replace single ones (``field_pitch`` foremost).
         progress: called with (windows done, windows in all), level by level.
 
@@ -276,6 +277,7 @@ def judge(
     box = as_aabb(aabb, caller="clean")
     check_denoiser(denoiser, caller="clean")
     warn_if_turned_away(cameras, box, caller="clean")
+    _warn_if_unused(cameras, denoiser)
     pitch, shape = grid_of(box, s)
     query = make_query(density_fn, place=box.mean(axis=0), backend=s.backend, chunk=s.chunk, caller="clean")
     survey = survey_field(
@@ -296,6 +298,15 @@ def judge(
     score, windows = _score(survey, denoiser, s, box, pitch, cameras, maps, progress)
     about = {"windows": windows, "denoiser": denoiser.manifest.name}
     return Judgement(box, pitch, score, s, denoiser.manifest.removal_threshold, survey, about)
+
+
+def _warn_if_unused(cameras: Cameras | None, denoiser: Denoiser) -> None:
+    if cameras is not None and not {"view_count", "transmittance"} & set(denoiser.manifest.channels):
+        warnings.warn(
+            f"clean: cameras are not used by the denoiser {denoiser.manifest.name!r} (as by default and xs); views uses"
+            " them (--denoiser views), but does worse than default where every ghost is visible to a training camera",
+            stacklevel=4,
+        )
 
 
 def grid_of(aabb: NDArray[np.float64], settings: CleanSettings) -> tuple[float, tuple[int, int, int]]:

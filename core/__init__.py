@@ -52,6 +52,9 @@ if TYPE_CHECKING:
     from .errors import MissingFile as MissingFile
     from .errors import UnghostError as UnghostError
     from .errors import needs_extra as needs_extra
+    from .file_kinds import FileKind as FileKind
+    from .file_kinds import file_kind as file_kind
+    from .file_kinds import not_readable as not_readable
     from .frames import RESOLUTION as RESOLUTION
     from .frames import CubeFrame as CubeFrame
     from .frames import cube_lattices as cube_lattices
@@ -137,6 +140,7 @@ __getattr__, __dir__, __all__ = attach(
             "UnghostError",
             "needs_extra",
         ],
+        ".file_kinds": ["FileKind", "file_kind", "not_readable"],
         ".frames": ["CubeFrame", "RESOLUTION", "cube_lattices", "random_rotations", "unit_lattice"],
         ".interpolate": ["corner_weights", "interpolate_grid", "lower_nodes", "trilinear_corners"],
         ".lattice": ["cell_centers", "cell_pitch", "cells_within", "lattice_axes", "lattice_origin", "look_up_cells"],

@@ -1,4 +1,4 @@
-"""A 3D Gaussian splat scene, cleaned: a keep score for every Gaussian, and a filtered .ply that viewers open.
+"""A 3D Gaussian splat scene, cleaned: a filtered .ply that viewers open.
 
     python examples/splats.py [scene.ply]
 

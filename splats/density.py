@@ -7,11 +7,13 @@ A splat of opacity ``o`` is a cloud whose centre, crossed along the splat's thin
 ``s_i`` being the smallest standard deviation of the covariance ``S_i``. Splats are often far thinner than what asks;
 each covariance is therefore widened by ``(pitch / 2)^2`` along all axes (the 3D filter of Mip-Splatting, Yu et al.
 2024, section 4.1), ``k_i`` for the widened one, so that no splat falls between two samples a pitch apart and its
-opacity, seen face-on, stays what it was. ``-ln(1 - o)`` is the softplus of the logit: exact where o rounds to 1.
+opacity, seen face-on, stays what it was. ``-ln(1 - o)`` is the softplus of the logit: exact where o rounds to 1. A
+logit beyond ``MOST_LOGIT`` counts as that: ``o`` is then 1 in float32, for which converters write infinity.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -22,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..core.errors import InvalidArgument
 from .ply import Gaussians
 
+MOST_LOGIT = 24.0 * math.log(2.0)  # of 1 - 2^-24, the largest opacity that float32 rounds to less than 1
 CUT = 3.0  # standard deviations; beyond, a splat counts as nothing
 PAIRS = 1 << 19  # of a position and a splat that are looked at together: about 100 MB
 _WRAP = 1 << 20  # cells are numbered modulo this along each axis
@@ -54,7 +57,7 @@ class SplatField:
     """
 
     def __init__(self, gaussians: Gaussians, *, pitch: float) -> None:
-        """List the splats by cell.
+        """List the splats by cell; those that are not valid are left out.
 
         Raises:
             ValueError: ``pitch`` is not finite and > 0.
@@ -62,10 +65,11 @@ class SplatField:
         if not 0.0 < pitch < np.inf:
             raise InvalidArgument(f"SplatField: pitch must be finite and > 0, got {pitch}")
         self.pitch = float(pitch)
+        gaussians = gaussians.only(gaussians.valid)
         spread = np.sqrt(gaussians.extents**2 + (pitch / 2) ** 2)
         self._means = gaussians.means
         self._whiten = (gaussians.rotations / spread[:, None, :]).transpose(0, 2, 1).astype(np.float32)
-        depth = np.logaddexp(0.0, gaussians.logits)
+        depth = np.logaddexp(0.0, np.minimum(gaussians.logits, MOST_LOGIT))
         self._peaks = depth / (np.sqrt(2.0 * np.pi) * spread.min(axis=1))
         self._reach_squared = (CUT * spread.max(axis=1)) ** 2
         reach = CUT * np.sqrt(np.einsum("nij,nj->ni", gaussians.rotations**2, spread**2))

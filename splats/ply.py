@@ -1,4 +1,4 @@
-"""The ``.ply`` of 3D Gaussian splatting, read to the letter and written back byte for byte. numpy only.
+"""The ``.ply`` of 3D (and 2D) Gaussian splatting, read and written back byte for byte. numpy only.
 
 Written here, because ``unghost clean`` reads splats on the base install, which has no ``plyfile``, and because rows
 stay on the disk until they are read: a file of 500,000 splats (124 MB) opens in 1 ms.
@@ -6,20 +6,52 @@ stay on the disk until they are read: a file of 500,000 splats (124 MB) opens in
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import warnings
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core.errors import InvalidArgument, InvalidFile, MissingFile
+from ..core.errors import InvalidArgument, InvalidFile
+from ..core.file_kinds import SPLATS, file_kind, not_readable
 from ..core.io import atomic_file
 from ..core.ply_types import PLY_TYPES
 
 MOST_HEADER = 1 << 16
 MOST_EXTENT = 1e30
-_NEEDED = ("x", "y", "z", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
+_NEEDED = ("x", "y", "z", "opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3")
 KEEP_SCORE = "keep_score"
+
+
+def _no_bytes() -> NDArray[np.uint8]:
+    return np.zeros(0, np.uint8)
+
+
+@dataclass(frozen=True)
+class Element:
+    """One element of a PLY header.
+
+    Attributes:
+        name: ``vertex``, ``face``, …
+        count: its rows.
+        dtype: of a row, without its lists.
+        list_bytes: least bytes that the lists of a row take (their lengths); 0 if it has none.
+
+    Example:
+        >>> Element("face", 2, np.dtype([]), 1).least_bytes
+        2
+    """
+
+    name: str
+    count: int
+    dtype: np.dtype[np.void]
+    list_bytes: int
+
+    @property
+    def least_bytes(self) -> int:
+        """Bytes of all rows; more where there are lists."""
+        return self.count * (self.dtype.itemsize + self.list_bytes)
 
 
 @dataclass(frozen=True)
@@ -27,12 +59,18 @@ class SplatPly:
     """The rows of a splat file, as they lie there.
 
     Attributes:
-        rows: ``(N,)`` structured, memory-mapped, one field a property.
+        rows: ``(N,)`` structured, memory-mapped, one field a property of the element ``vertex``.
         header: the lines of its header, without the line's end.
+        before: bytes of the elements that stand before ``vertex``.
+        after: bytes of those behind it, memory-mapped.
+        others: those elements.
     """
 
     rows: NDArray[np.void]
     header: tuple[str, ...]
+    before: NDArray[np.uint8] = field(default_factory=_no_bytes)
+    after: NDArray[np.uint8] = field(default_factory=_no_bytes)
+    others: tuple[Element, ...] = ()
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -44,12 +82,14 @@ class SplatPly:
     def gaussians(self) -> Gaussians:
         """Activated as the renderers do: exponential, sigmoid, normalised quaternion (w, x, y, z).
 
-        Raises:
-            ValueError: values that are not finite, or a rotation of length 0.
+        A file of 2D Gaussians (``scale_0`` and ``scale_1`` alone) has discs: their third extent is 0.
         """
         means = self.columns("x", "y", "z")
+        extents = np.zeros((len(self), 3))
         with np.errstate(over="ignore"):
-            extents = np.exp(self.columns("scale_0", "scale_1", "scale_2"))
+            for axis, name in enumerate(("scale_0", "scale_1", "scale_2")):
+                if name in (self.rows.dtype.names or ()):
+                    extents[:, axis] = np.exp(self.columns(name)[:, 0])
         quaternions = self.columns("rot_0", "rot_1", "rot_2", "rot_3")
         return Gaussians.create(means, extents, quaternions, self.columns("opacity")[:, 0])
 
@@ -60,14 +100,14 @@ class Gaussians:
 
     Attributes:
         means: ``(N, 3)``, scene units.
-        extents: ``(N, 3)`` standard deviations along their own axes, scene units, > 0.
+        extents: ``(N, 3)`` standard deviations along their own axes, scene units, >= 0 (0: a disc, a needle, a point).
         rotations: ``(N, 3, 3)``, columns are their own axes.
-        logits: ``(N,)``, of the opacity.
+        logits: ``(N,)``, of the opacity; infinity is opaque, minus infinity transparent.
 
     Example:
         >>> gaussians = Gaussians(np.zeros((1, 3)), np.full((1, 3), 0.1), np.eye(3)[None], np.zeros(1))
-        >>> gaussians.opacity().tolist()
-        [0.5]
+        >>> gaussians.opacity().tolist(), gaussians.valid.tolist()
+        ([0.5], [True])
     """
 
     means: NDArray[np.float64]
@@ -77,7 +117,19 @@ class Gaussians:
 
     @classmethod
     def create(cls, means: ArrayLike, extents: ArrayLike, quaternions: ArrayLike, logits: ArrayLike) -> Gaussians:
-        """Validate; ``quaternions (N, 4)`` w, x, y, z of any length but 0."""
+        """Check the shapes and turn quaternions into rotations.
+
+        Args:
+            means: ``(N, 3)``, scene units.
+            extents: ``(N, 3)``, scene units, >= 0.
+            quaternions: ``(N, 4)`` w, x, y, z of any length but 0.
+            logits: ``(N,)``, of the opacity.
+
+        Values are not refused: :attr:`valid` says which Gaussians can be judged.
+
+        Raises:
+            ValueError: shapes that do not fit each other.
+        """
         place, sides, turns, logit = (np.asarray(a, dtype=np.float64) for a in (means, extents, quaternions, logits))
         count = len(place)
         if (place.shape, sides.shape, turns.shape, logit.shape) != ((count, 3), (count, 3), (count, 4), (count,)):
@@ -85,15 +137,8 @@ class Gaussians:
                 "Gaussians: means, extents, quaternions, logits must have shapes (N, 3), (N, 3), (N, 4), (N,), got "
                 f"{place.shape}, {sides.shape}, {turns.shape}, {logit.shape}"
             )
-        length = np.linalg.norm(turns, axis=1)
-        good = np.isfinite(np.column_stack([place, turns, logit])).all(axis=1) & (length > 0)
-        good &= ((sides > 0) & (sides < MOST_EXTENT)).all(axis=1)
-        if not good.all():
-            raise InvalidArgument(
-                f"Gaussians: means, rotations and opacity must be finite, extents in (0, {MOST_EXTENT}); "
-                f"{int((~good).sum())} of {count} are not, the first is number {int(np.argmin(good))}"
-            )
-        w, x, y, z = (turns / length[:, None]).T
+        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):  # 0 / 0 is NaN: not valid
+            w, x, y, z = (turns / np.linalg.norm(turns, axis=1)[:, None]).T
         rows = [
             [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
             [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
@@ -101,22 +146,45 @@ class Gaussians:
         ]
         return cls(place, sides, np.moveaxis(np.array(rows), -1, 0), logit)
 
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """``(N,)``: which can be judged. Means and rotations are finite, extents in [0, 1e30), logits not NaN."""
+        good = np.isfinite(self.means).all(axis=1) & np.isfinite(self.rotations).all(axis=(1, 2))
+        good &= ((self.extents >= 0) & (self.extents < MOST_EXTENT)).all(axis=1) & ~np.isnan(self.logits)
+        return np.asarray(good)
+
+    def only(self, chosen: NDArray[np.bool_]) -> Gaussians:
+        """Those of a mask ``(N,)``; the same object if it is all of them."""
+        if chosen.all():
+            return self
+        parts = (self.means, self.extents, self.rotations, self.logits)
+        return Gaussians(*(part[chosen] for part in parts))
+
     def __len__(self) -> int:
         return len(self.means)
 
     def opacity(self) -> NDArray[np.float64]:
-        """``(N,)`` in (0, 1]."""
+        """``(N,)`` in [0, 1]; NaN where the logit is."""
         return 1.0 / (1.0 + np.exp(-np.clip(self.logits, -700.0, 700.0)))
 
     def aabb(self, *, share: float = 0.98) -> NDArray[np.float64]:
         """``(2, 3)``: the box that holds this share of the means along each axis, weighted by opacity.
 
-        A capture's last per cent are splats of the far background; a box around them would be mostly empty.
+        A capture's last per cent are splats of the far background; a box around them would be mostly empty. Those
+        that are not valid do not count.
+
+        Raises:
+            ValueError: an impossible share; no Gaussians, or none that is valid.
         """
         if not 0.0 < share <= 1.0:
             raise InvalidArgument(f"Gaussians.aabb: share must lie in (0, 1], got {share}")
         if len(self) == 0:
             raise InvalidArgument("Gaussians.aabb: there are no Gaussians")
+        valid = self.valid
+        if not valid.all():
+            if not valid.any():
+                raise InvalidArgument(f"Gaussians.aabb: not one of {len(self)} Gaussians is finite")
+            return self.only(valid).aabb(share=share)
         weight = self.opacity()
         box = np.empty((2, 3))
         for axis in range(3):
@@ -132,10 +200,12 @@ class Gaussians:
 def read_splat_ply(path: str | Path) -> SplatPly:
     """Open a splat file; its rows stay on the disk until they are read.
 
+    Elements beside ``vertex`` (Apple's ml-sharp and gsbox write some) are kept as bytes.
+
     Raises:
         FileNotFoundError: no such file.
-        ValueError: not a binary little-endian PLY of one element ``vertex`` of plain numbers, without the properties of
-            3D Gaussian splatting, or shorter or longer than its header says.
+        ValueError: not a binary little-endian PLY with an element ``vertex`` of plain numbers and the properties of
+            Gaussian splatting (the message says what else it is), or of another length than its header says.
 
     Example:
         >>> import tempfile
@@ -149,8 +219,9 @@ def read_splat_ply(path: str | Path) -> SplatPly:
         2 [[1.0, 1.0, 1.0], [1.0, 1.0, 1.0]]
     """
     source = Path(path)
-    if not source.is_file():
-        raise MissingFile(f"read_splat_ply: no file {source}")
+    kind = file_kind(source, caller="read_splat_ply")
+    if kind is not SPLATS:
+        raise not_readable(source, kind, caller="read_splat_ply")
 
     def refuse(rule: str) -> InvalidFile:
         return InvalidFile(f"read_splat_ply: {source} is not a PLY of Gaussian splats: {rule}")
@@ -159,52 +230,88 @@ def read_splat_ply(path: str | Path) -> SplatPly:
         start = stream.read(MOST_HEADER)
     end = start.find(b"\nend_header")
     tail = start[end + 11 : end + 13]
-    if not start.startswith((b"ply\n", b"ply\r\n")) or end < 0 or not tail.startswith((b"\n", b"\r\n")):
+    if end < 0 or not tail.startswith((b"\n", b"\r\n")):
         raise refuse("it has no PLY header")
     begins = end + (12 if tail.startswith(b"\n") else 13)
     lines = tuple(line.rstrip("\r") for line in start[:end].decode("latin-1").split("\n"))
     try:
-        count, dtype = _layout(lines[1:])
+        elements = _elements(lines[1:])
+        place = _place_of_vertices(elements)
     except ValueError as error:
         raise refuse(str(error)) from None
-    missing = [name for name in _NEEDED if name not in (dtype.names or ())]
+    vertex, others = elements[place], (*elements[:place], *elements[place + 1 :])
+    missing = [name for name in _NEEDED if name not in (vertex.dtype.names or ())]
     if missing:
         raise refuse(f"it lacks the properties {', '.join(missing)}")
-    excess = source.stat().st_size - begins - count * dtype.itemsize
-    if excess:
+    excess = source.stat().st_size - begins - sum(element.least_bytes for element in elements)
+    if excess < 0 or (excess > 0 and not any(element.list_bytes for element in others)):
         state = "longer" if excess > 0 else "shorter"
-        raise refuse(f"its body is {abs(excess)} bytes {state} than {count} rows of {dtype.itemsize}")
-    rows = np.memmap(source, dtype, "r", begins, (count,)) if count else np.zeros(0, dtype)
-    return SplatPly(rows, lines)
+        beside = f" and the elements {', '.join(element.name for element in others)}" if others else ""
+        raise refuse(
+            f"its body is {abs(excess)} bytes {state} than {vertex.count} rows of {vertex.dtype.itemsize}{beside}"
+        )
+    first = begins + sum(element.least_bytes for element in elements[:place])
+    behind = first + vertex.least_bytes
+    rows = np.memmap(source, vertex.dtype, "r", first, (vertex.count,)) if vertex.count else np.zeros(0, vertex.dtype)
+    return SplatPly(
+        rows, lines, _bytes_of(source, begins, first), _bytes_of(source, behind, source.stat().st_size), others
+    )
 
 
-def _layout(lines: tuple[str, ...]) -> tuple[int, np.dtype[np.void]]:
-    """Rows, and a row's layout."""
-    count, order = -1, ""
-    fields: list[tuple[str, str]] = []
+def _bytes_of(source: Path, first: int, last: int) -> NDArray[np.uint8]:
+    return np.memmap(source, np.uint8, "r", first, (last - first,)) if last > first else _no_bytes()
+
+
+def _elements(lines: tuple[str, ...]) -> tuple[Element, ...]:
+    """The elements of a header, in their order."""
+    order, properties = "", 0
+    found: list[tuple[str, int, list[tuple[str, str]], list[int]]] = []
     for line in lines:
         words = line.split()
         if not words or words[0] in ("comment", "obj_info"):
             continue
+        properties += words[0] == "property"
         if words == ["format", "binary_little_endian", "1.0"]:
             order = "<"
-        elif words[0] == "element" and len(words) == 3 and words[1] == "vertex" and words[2].isdecimal() and count < 0:
-            count = int(words[2])
-        elif words[0] == "property" and len(words) == 3 and words[1] in PLY_TYPES and count >= 0 and len(fields) < 512:
-            fields.append((words[2], f"<{PLY_TYPES[words[1]]}"))
+        elif words[0] == "element" and len(words) == 3 and words[2].isdecimal() and len(found) < 64:
+            found.append((words[1], int(words[2]), [], []))
+        elif words[0] == "property" and len(words) == 3 and words[1] in PLY_TYPES and found and properties <= 512:
+            found[-1][2].append((words[2], f"<{PLY_TYPES[words[1]]}"))
+        elif (
+            words[:2] == ["property", "list"]
+            and len(words) == 5
+            and words[3] in PLY_TYPES
+            and PLY_TYPES.get(words[2], "f")[0] in "iu"
+            and found
+            and properties <= 512
+        ):
+            found[-1][3].append(np.dtype(PLY_TYPES[words[2]]).itemsize)
         else:
-            raise InvalidFile(
-                f"the header's line {line[:60]!r} (wanted: binary_little_endian, one element, plain numbers)"
-            )
-    if not order or count < 0 or len({name for name, _ in fields}) != len(fields) or not fields:
-        raise InvalidFile("its header names no format, no vertices, no properties, or one twice")
-    return count, np.dtype(fields)
+            raise InvalidFile(f"the header's line {line[:60]!r} (wanted: binary_little_endian, element, property)")
+    if not order or any(len(dict(fields)) != len(fields) for _, _, fields, _ in found):
+        raise InvalidFile("its header names no format, or a property twice")
+    return tuple(Element(name, count, np.dtype(fields), sum(lists)) for name, count, fields, lists in found)
+
+
+def _place_of_vertices(elements: tuple[Element, ...]) -> int:
+    """Index of the element ``vertex``, which has no lists and none before it."""
+    names = [element.name for element in elements]
+    if names.count("vertex") != 1:
+        raise InvalidFile(f"its header must name one element vertex, got {', '.join(names) or 'none'}")
+    place = names.index("vertex")
+    listed = [element.name for element in elements[: place + 1] if element.list_bytes and element.count]
+    if listed:
+        raise InvalidFile(f"element {listed[0]} has a list property; only elements behind vertex may")
+    return place
 
 
 def write_splat_ply(
     path: str | Path, splats: SplatPly, *, keep: NDArray[np.bool_], keep_score: NDArray[np.floating] | None = None
 ) -> None:
     """Write the rows to keep, every property as it was, byte for byte; whole or not at all.
+
+    Elements beside ``vertex`` are written as they came. A warning is raised where rows are left out and such an
+    element has lists or as many rows as there were splats: it may count or number them.
 
     Args:
         path: a new file, or one to be replaced. Never the one that ``splats`` was read from, which is still open.
@@ -241,8 +348,16 @@ def write_splat_ply(
     if keep_score is not None:
         fields.append((KEEP_SCORE, np.dtype("<f4")))
     chosen = np.flatnonzero(keep)
+    bound = [e.name for e in splats.others if e.count and (e.list_bytes or e.count == len(splats))]
+    if bound and len(chosen) < len(splats):
+        warnings.warn(
+            f"write_splat_ply: the element {', '.join(bound)} of {target.name} is as it was before rows were left out; "
+            "it may refer to them",
+            stacklevel=2,
+        )
     with atomic_file(target) as stream:
         stream.write(_header(splats.header, len(chosen), with_score=keep_score is not None))
+        stream.write(splats.before.tobytes())
         for start in range(0, len(chosen), 1 << 16):
             part = chosen[start : start + (1 << 16)]
             rows = np.empty(len(part), np.dtype(fields))
@@ -251,16 +366,23 @@ def write_splat_ply(
             if keep_score is not None:
                 rows[KEEP_SCORE] = keep_score[part]
             stream.write(rows.tobytes())
+        for start in range(0, len(splats.after), 1 << 24):
+            stream.write(splats.after[start : start + (1 << 24)].tobytes())
 
 
 def _header(lines: tuple[str, ...], count: int, *, with_score: bool) -> bytes:
-    kept = []
+    """The header for ``count`` vertices; the score is their last property."""
+    kept, element, end = list[str](), "", 0  # end: behind the last property of the vertices
     for line in lines:
         words = line.split()
-        if words[:2] == ["element", "vertex"]:
-            line = f"element vertex {count}"
-        if not (with_score and words[:1] == ["property"] and words[-1] == KEEP_SCORE):
-            kept.append(line)
+        if words[:1] == ["element"]:
+            element = words[1]
+            line = f"element vertex {count}" if element == "vertex" else line
+        in_vertex = element == "vertex" and words[:1] in (["element"], ["property"])
+        if with_score and in_vertex and words[0] == "property" and words[-1] == KEEP_SCORE:
+            continue
+        kept.append(line)
+        end = len(kept) if in_vertex else end
     if with_score:
-        kept.append(f"property float {KEEP_SCORE}")
+        kept.insert(end, f"property float {KEEP_SCORE}")
     return ("\n".join([*kept, "end_header"]) + "\n").encode("latin-1")

@@ -243,7 +243,7 @@ def _open_array(path: Path, shape: tuple[int, ...], dtype: str) -> NDArray[Any]:
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
-        raise InvalidFile(f"read_shard: cannot read {path} ({error})") from None
+        raise InvalidFile(f"read_shard: cannot read {path} as one array of numbers ({type(error).__name__})") from None
     if not isinstance(array, np.memmap) or not array.flags.c_contiguous:
         raise InvalidFile(f"read_shard: cannot read {path} (it is not one array in C order)")
     if array.shape != shape or array.dtype != np.dtype(dtype):

@@ -230,7 +230,8 @@ def _read(source: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         zipfile.BadZipFile,
         zlib.error,
     ) as error:
-        raise InvalidFile(f"{caller}: {source} is not pseudo ground truth, or is truncated ({error})") from None
+        fault = type(error).__name__  # not numpy's text, which may advise to unpickle
+        raise InvalidFile(f"{caller}: {source} is not pseudo ground truth, or is truncated ({fault})") from None
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise InvalidFile(f"{caller}: {source} is not pseudo ground truth (format must be {FORMAT!r})")
     if manifest.get("format_version") != FORMAT_VERSION:

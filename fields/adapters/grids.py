@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...core.aabb import as_aabb
 from ...core.errors import InvalidArgument, InvalidFile, MissingFile
+from ...core.file_kinds import GRID, file_kind, not_readable
 from ...core.interpolate import interpolate_grid
 from ...core.io import write_npz
 from ...core.lattice import cell_centers as cell_centers
@@ -75,8 +77,11 @@ def load_grid(path: str | Path) -> tuple[NDArray[np.float32], NDArray[np.float64
             arrays = {name: archive[name] for name in ("density", "aabb") if name in archive}
     except FileNotFoundError:
         raise MissingFile(f"load_grid: no file {source}") from None
-    except (OSError, ValueError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as error:
-        raise InvalidFile(f"load_grid: {source} is not an .npz file, or is truncated ({error})") from None
+    except (OSError, ValueError, EOFError, TypeError, AttributeError, zipfile.BadZipFile, zlib.error):
+        kind = file_kind(source, caller="load_grid")
+        if kind is not GRID:
+            raise not_readable(source, kind, caller="load_grid") from None
+        raise InvalidFile(f"load_grid: density or aabb in {source} is truncated, or no array of numbers") from None
     missing = sorted({"density", "aabb"} - set(arrays))
     if missing:
         raise InvalidFile(f"load_grid: {source} must hold the arrays density and aabb, lacks {', '.join(missing)}")

@@ -1,10 +1,12 @@
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from unghost.splats import density as splats
-from unghost.splats.density import CUT, SplatField
+from unghost.splats.density import CUT, MOST_LOGIT, SplatField
 from unghost.splats.ply import Gaussians
 
 
@@ -42,8 +44,8 @@ def test_the_sum(seed, pitch, spread):
     assert near_cut.mean() < 0.02  # in float32 a point may fall on the other side of the cut
 
 
-@pytest.mark.parametrize("logit", [-3.0, 0.0, 2.0, 40.0])
-@pytest.mark.parametrize("extent", [1e-4, 0.02, 0.3])
+@pytest.mark.parametrize("logit", [-math.inf, -3.0, 0.0, 2.0, 40.0, math.inf])
+@pytest.mark.parametrize("extent", [0.0, 1e-4, 0.02, 0.3])
 def test_seen_face_on_the_opacity_is_the_splats(logit, extent):
     """A disc 0.3 wide and ``extent`` thick, crossed through its centre along its thin axis."""
     disc = Gaussians.create([[0.1, 0.2, 0.3]], [[0.3, 0.3, extent]], [[1.0, 0, 0, 0]], [logit])
@@ -51,7 +53,9 @@ def test_seen_face_on_the_opacity_is_the_splats(logit, extent):
     z = np.linspace(-2, 2, 40001)
     line = np.stack([np.full_like(z, 0.1), np.full_like(z, 0.2), z + 0.3], axis=1)
     depth = float(field.density_fn(line).astype(np.float64).sum() * (z[1] - z[0]))
-    assert depth == pytest.approx(np.logaddexp(0, logit), rel=3e-3)  # the cut takes 0.27 % of a Gaussian
+    assert depth == pytest.approx(
+        np.logaddexp(0, min(logit, MOST_LOGIT)), rel=3e-3
+    )  # the cut takes 0.27 % of a Gaussian
 
 
 def test_no_disc_falls_between_samples():
@@ -63,6 +67,26 @@ def test_no_disc_falls_between_samples():
         disc = Gaussians.create([[0, 0, shift]], [[0.5, 0.5, 1e-6]], [[1.0, 0, 0, 0]], [0.0])
         depth = SplatField(disc, pitch=pitch).density_fn(line).sum() * pitch
         assert depth == pytest.approx(np.log(2), rel=0.1)
+
+
+def test_opaque_is_what_float32_rounds_to_one():
+    logits = np.array([MOST_LOGIT - 1.0, MOST_LOGIT + 0.7])
+    opacity = (1.0 / (1.0 + np.exp(-logits))).astype(np.float32)
+    assert opacity[0] < 1.0 == opacity[1]
+
+
+def test_what_cannot_be_judged_is_left_out():
+    """The field is that of the others, and finite."""
+    whole = cloud(30, 2)
+    means, turns = whole.means.copy(), whole.rotations.copy()
+    means[3, 1], turns[7] = np.nan, np.nan
+    some = Gaussians(means, whole.extents, turns, whole.logits)
+    assert np.flatnonzero(~some.valid).tolist() == [3, 7]
+    points = np.random.default_rng(3).uniform(-1, 1, (200, 3))
+    found = SplatField(some, pitch=0.05).density_fn(points)
+    np.testing.assert_array_equal(found, SplatField(whole.only(some.valid), pitch=0.05).density_fn(points))
+    assert np.isfinite(found).all()
+    assert (found != SplatField(whole, pitch=0.05).density_fn(points)).any()
 
 
 def test_turned_with_the_splat():

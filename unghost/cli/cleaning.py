@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,8 +10,10 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from ..cleaning.pipeline import CleanSettings
 from ..core.errors import InvalidArgument
+from ..core.file_kinds import GRID, SPLATS, file_kind, not_readable
 from ..core.progress import StagedProgress
 from .options import given, options_of
+from .plain_warnings import plain_warnings
 from .prior import Threads
 
 if TYPE_CHECKING:
@@ -23,6 +25,7 @@ else:
     _NEEDS_A_FIELD = "field_pitch", "rule", "soft", "skip_empty", "backend", "chunk"
     CleanOptions = options_of(CleanSettings, leave_out=(*_ELSEWHERE, *_NEEDS_A_FIELD))
 
+SPLAT_SUFFIXES = {".ply", ".splat", ".ksplat", ".spz", ".sog"}
 Box = tuple[float, float, float, float, float, float]
 
 
@@ -38,18 +41,21 @@ def clean(
     strength: float = 0.5,
     resolution: int | None = None,
     reach: float | None = None,
+    box: Box | None = None,
+    keep_score: bool = False,
     scores_only: bool = False,
     threads: Threads = 0,
     options: Annotated[CleanOptions, arg(name="")] = CleanOptions(),  # noqa: B008 (frozen)
 ) -> None:
     """Clean a density grid (.npz) or 3D Gaussians (.ply); writes a cleaned copy and the mask of what stays.
 
-    A grid file has density (X, Y, Z) per scene unit and aabb (2, 3); its cells are cubes.
+    A grid file has density (X, Y, Z) per scene unit and aabb (2, 3); its cells are cubes. What a file is, its content
+    says, not its name.
 
     Args:
         source: the file to clean; it is not changed.
         out: the cleaned grid or splats; NAME-clean beside it if not given. Every property of a splat that stays is kept
-            byte for byte, and keep_score is added.
+            byte for byte, and none is added.
         keep: the mask of what was kept, with which --mask repeats the cleaning; NAME-keep.npz if not given
             (with --mask: none).
         preview: a PNG to write instead of all that: what would stay and what would go, from three sides; the regions
@@ -58,39 +64,52 @@ def clean(
         keep_box: x0 y0 z0 x1 y1 z1, scene units: nothing in this box is removed; may be given several times. With
             --mask, takes back what that removed there (the boxes of the preview's table, say).
         cameras: a transforms.json (nerfstudio's format) of the training photos, in the file's own world; where few
-            or none of them look, ghosts are likelier. The photos themselves are not needed.
+            or none of them look, ghosts are likelier. For --denoiser views; the others do not use them. The photos
+            themselves are not needed.
         denoiser: a shipped name or an .onnx file.
         strength: 0 removes nothing, 0.5 what the denoiser advises, 1 everything.
         resolution: of splats, cells along the longest side of the box; by the splats' sizes if not given.
         reach: of splats, how many times the scene's core (98 % of the opacity) is cleaned (twice if not given); what
             is beyond stays.
+        box: of splats, x0 y0 z0 x1 y1 z1, scene units, in place of reach: only what is in this box is judged, and all
+            else stays. For an object that is small beside its surroundings.
+        keep_score: of splats, add the property keep_score to those that stay (strict readers refuse it).
         scores_only: of splats, write all of them with their keep_score, and remove none.
         threads: of onnxruntime; 0 leaves the choice to it.
     """
     from ..cleaning.keep_mask import KeepMask
 
-    splats = source.suffix == ".ply"
-    target = None if preview else out or source.with_name(f"{source.stem}-clean{source.suffix}")
+    splats = _is_splats(source)
+    suffix = ".ply" if splats else ".npz"
+    suffix = source.suffix if source.suffix.lower() == suffix else suffix
+    target = None if preview else out or source.with_name(f"{source.stem}-clean{suffix}")
     keep = None if preview or (mask and keep is None) else keep or source.with_name(f"{source.stem}-keep.npz")
     _check_distinct(source=source, out=target, keep=keep, preview=preview, mask=mask)
-    if not splats and (resolution is not None or reach is not None or scores_only):
-        raise InvalidArgument(
-            f"clean: --resolution, --reach and --scores-only are for splats (.ply); {source.name} is a grid"
-        )
-    boxes = [[box[:3], box[3:]] for box in keep_box]
+    _check_suffix(target, splats=splats)
+    of_splats = {
+        "resolution": resolution,
+        "reach": reach,
+        "box": None if box is None else [box[:3], box[3:]],
+        "keep_score": keep_score or None,
+        "scores_only": scores_only or None,
+    }
+    how: dict[str, Any] = {name: value for name, value in of_splats.items() if value is not None}
+    if how and not splats:
+        raise InvalidArgument(f"clean: {_options(of_splats)} are for splats (.ply); {source.name} is a grid")
+    if reach is not None and box is not None:
+        raise InvalidArgument("clean: --box is judged in place of --reach; leave one of them out")
+    boxes = [[corners[:3], corners[3:]] for corners in keep_box]
     settings = given(options)
-    how: dict[str, Any] = {}
-    if mask is not None:
-        if settings:
-            raise InvalidArgument(f"clean: --mask repeats a cleaning as it was; leave out {', '.join(settings)}")
-        how = {"mask": KeepMask.load(mask).restored(boxes)}
-    else:
-        how = {"keep_boxes": tuple(boxes), **_judging(denoiser, threads, strength, cameras)}
-        how |= {"settings": CleanSettings(**settings)} if settings else {}
-        how |= {"resolution": resolution} if splats else {}
-        how |= {} if reach is None else {"reach": reach}
-    how |= {"scores_only": scores_only} if splats else {}
-    found, density_fn = (_clean_splats if splats else _clean_grid)(source, target, **how)
+    with plain_warnings():
+        if mask is not None:
+            if settings or box is not None:
+                unused = [*settings, *(["box"] if box is not None else [])]
+                raise InvalidArgument(f"clean: --mask repeats a cleaning as it was; leave out {', '.join(unused)}")
+            how["mask"] = KeepMask.load(mask).restored(boxes)
+        else:
+            how |= {"keep_boxes": tuple(boxes), **_judging(denoiser, threads, strength, cameras)}
+            how |= {"settings": CleanSettings(**settings)} if settings else {}
+        found, density_fn = (_clean_splats if splats else _clean_grid)(source, target, **how)
     if preview:
         from .removal_preview import region_table, write_preview
 
@@ -102,9 +121,8 @@ def clean(
         found.save(keep)
     summary = found.summary()
     back = f", what lay in {len(summary['restored'])} boxes taken back" if "restored" in summary else ""
-    print(
-        f"removed {summary['removed']} of {summary['occupied']} occupied cells ({summary['removed_share']:.1%}){back}"
-    )
+    removed, occupied = (summary.get(name, 0) for name in ("removed", "occupied"))  # absent in a mask made by hand
+    print(f"removed {removed} of {occupied} occupied cells ({summary['removed_share']:.1%}){back}")
     print(f"cleaned: {target}" + (f"\nkeep mask: {keep}" if keep else ""))
 
 
@@ -119,6 +137,31 @@ def _judging(denoiser: str, threads: int, strength: float, cameras: Path | None)
         "cameras": None if cameras is None else load_cameras(cameras),
         "progress": StagedProgress("cube"),
     }
+
+
+def _is_splats(source: Path) -> bool:
+    """Whether the file holds splats, and not a grid.
+
+    Raises:
+        ValueError: it holds neither; the message says what it is and what to do.
+    """
+    kind = file_kind(source, caller="clean")
+    if kind not in (SPLATS, GRID):
+        raise not_readable(source, kind, caller="clean")
+    return kind is SPLATS
+
+
+def _check_suffix(target: Path | None, *, splats: bool) -> None:
+    """No file is written under the name of another format."""
+    wrong = SPLAT_SUFFIXES if not splats else {".npz", *SPLAT_SUFFIXES} - {".ply"}
+    if target is not None and target.suffix.lower() in wrong:
+        written = "splats are written as .ply" if splats else "grids are written as .npz"
+        raise InvalidArgument(f"clean: {written}, got --out {target.name}")
+
+
+def _options(names: Iterable[str]) -> str:
+    words = [f"--{name.replace('_', '-')}" for name in names]
+    return f"{', '.join(words[:-1])} and {words[-1]}"
 
 
 def _check_distinct(**files: Path | None) -> None:
@@ -153,6 +196,11 @@ def _clean_splats(source: Path, target: Path | None, **options: Any) -> tuple[Ke
     from ..facade import clean_ply
 
     found = clean_ply(source, target, **options)
-    gone = int((~found.keep).sum())
+    gone = int((~found.keep & found.valid).sum())
     print(f"{gone} of {len(found.keep)} Gaussians ({gone / max(len(found.keep), 1):.1%}) are ghosts")
+    invalid = ~found.valid
+    if invalid.any():
+        dropped = bool((invalid & ~found.keep).any())
+        fate = "are removed" if dropped else "stay as they are (--drop-invalid removes them)"
+        print(f"{int(invalid.sum())} cannot be judged (NaN, infinite, or a rotation of length 0) and {fate}")
     return found.mask, found.field.density_fn

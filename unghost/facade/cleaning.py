@@ -40,7 +40,8 @@ def clean(
         density_fn: ``positions (M, 3) float32 -> density (M, 1) or (M,)``, >= 0 per scene unit; it takes and returns
             numpy arrays or torch tensors (which of the two is found out with one point).
         aabb: ``(2, 3)`` smallest and largest corner, scene units; nothing outside it is changed.
-        cameras: of the training photos, for a denoiser that uses view counts (``load_denoiser("views")``).
+        cameras: of the training photos, for a denoiser that uses view counts (``load_denoiser("views")``); any other
+            ignores them, with a warning.
         denoiser: from :func:`unghost.load_denoiser`; None loads the shipped default through onnxruntime.
         strength: in [0, 1]: 0 removes nothing, 0.5 (the default) uses the denoiser's own threshold, 1 removes
             everything.
@@ -90,6 +91,7 @@ def clean_splats(
     strength: float | None = None,
     resolution: int | None = None,
     reach: float = REACH,
+    box: ArrayLike | None = None,
     keep_boxes: Sequence[ArrayLike] | None = None,
     mask: KeepMask | None = None,
     settings: CleanSettings | None = None,
@@ -99,22 +101,27 @@ def clean_splats(
 
     Args:
         gaussians: ``read_splat_ply(path).gaussians()`` of :mod:`unghost.splats`, or ``Gaussians.create(...)``.
-        cameras: of the training photos, for a denoiser that uses view counts.
+        cameras: of the training photos, for a denoiser that uses view counts (``load_denoiser("views")``); any other
+            ignores them, with a warning.
         denoiser: from :func:`unghost.load_denoiser`; None loads the shipped default through onnxruntime.
         strength: in [0, 1]: 0 removes nothing, 0.5 (the default) uses the denoiser's own threshold, 1 removes
             everything.
         resolution: cells along the longest side of the box, >= 8; None derives it from the sizes of the splats.
         reach: the box is this many times the core of the scene (98 % of the opacity), >= 1; what is beyond stays.
+        box: ``(2, 3)`` scene units, in place of that: only what lies in it is judged, all else stays. For an object
+            that is small beside its surroundings (a statue on a lawn).
         keep_boxes: ``(2, 3)`` boxes, scene units, in which nothing is removed.
         mask: of an earlier cleaning, to apply it again instead of judging.
-        settings: all other settings; ``strength`` and ``keep_boxes`` replace theirs where given.
+        settings: all other settings; ``strength`` and ``keep_boxes`` replace theirs where given. Gaussians that cannot
+            be judged (NaN, a rotation of length 0) stay, or go with ``drop_invalid``.
         progress: called with (windows done, windows in all).
 
     Returns:
-        ``keep_score (N,)`` in [0, 1], ``keep (N,)`` bool, the ``mask`` and the density ``field`` that was judged.
+        ``keep_score (N,)`` in [0, 1], ``keep (N,)`` and ``valid (N,)`` bool (which could be judged), the ``mask`` and
+        the density ``field`` that was judged.
 
     Raises:
-        ValueError: a resolution or reach out of range; an impossible setting.
+        ValueError: a resolution or reach out of range; an impossible setting; a box without Gaussians.
 
     Example:
         >>> import numpy as np
@@ -140,6 +147,7 @@ def clean_splats(
         denoiser=load_denoiser() if denoiser is None else denoiser,
         resolution=resolution,
         reach=reach,
+        box=box,
         mask=mask,
         cameras=cameras,
         settings=dataclasses.replace(settings or CleanSettings(), **changes),

@@ -204,7 +204,7 @@ def test_foreign_files_are_refused(tmp_path):
     with pytest.raises(ValueError, match="is not pseudo ground truth"):
         load_pseudo_truth(path)
     np.savez(path, manifest=np.array([{"format": "unghost-pseudo-gt"}], dtype=object))
-    with pytest.raises(ValueError, match=r"is not pseudo ground truth.*allow_pickle=False"):
+    with pytest.raises(ValueError, match=r"is not pseudo ground truth.*\(ValueError\)"):
         load_pseudo_truth(path)
     _maps().save(path)
     _rewrite(path, manifest={"format": "unghost-keep-mask"})

@@ -1,5 +1,6 @@
 """What ``unghost clean`` can be told besides what to clean."""
 
+import json
 import re
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from unghost import cli
 from unghost.cleaning.keep_mask import KeepMask
+from unghost.core.file_kinds import file_kind
 from unghost.fields.adapters.grids import load_grid, save_grid
 
 BOX = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
@@ -57,6 +59,7 @@ def test_boxes_are_left_alone_or_taken_back(cleaned, capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
+        (["--out", "never.splat"], "grids are written as .npz, got --out never.splat"),
         (["--keep-box", "1", "0", "0", "0", "1", "1"], "keep_boxes"),
         (["--mask", "g-clean.npz"], "is not a keep mask"),
         (["--mask", "g-keep.npz", "--keep", "g-keep.npz"], "mask and keep are the same file"),
@@ -71,3 +74,62 @@ def test_impossible_words(cleaned, words, message, capsys, monkeypatch):
     assert cli.main(["clean", "g.npz", "-o", "never.npz", *words]) != 0
     assert re.search(message, capsys.readouterr().err)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_a_grid_is_one_whatever_its_name(cleaned, tmp_path):
+    folder, _, _ = cleaned
+    KeepMask(BOX, 0.5, np.arange(64).reshape(4, 4, 4) > 9).save(tmp_path / "k.npz")
+    for name, out in (("g.PLY", "g-clean.npz"), ("h.NPZ", "h-clean.NPZ"), ("i", "i-clean.npz")):
+        (tmp_path / name).write_bytes((folder / "g.npz").read_bytes())
+        assert cli.main(["clean", str(tmp_path / name), "--mask", str(tmp_path / "k.npz")]) == 0
+        density = load_grid(tmp_path / out)[0]
+        assert not density[:8, :8].any()
+        assert density.any()
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.npz", b"\x93NUMPY\x01\x00", "a single .npy array: save it with its box"),
+        ("a.ply", b"version https://git-lfs.github.com/spec/v1\n", "a git-lfs pointer.*git lfs pull"),
+        ("a.spz", b"NGSP" + bytes(60), r"a compressed splat file \(.spz\): convert it to a 3DGS .ply, with SuperSplat"),
+        ("a.npz", b"PK\x03\x04", "an .npz or .sog archive without its end"),
+        ("a.npz", b"text", "of no known format"),
+        ("folder", None, "a folder: name a file in it"),
+    ],
+)
+def test_other_files_are_named_with_what_to_do(tmp_path, capsys, name, content, message):
+    source = tmp_path / name
+    source.mkdir() if content is None else source.write_bytes(content)
+    assert cli.main(["clean", str(source)]) == 2
+    error = capsys.readouterr().err
+    assert re.search(message, error)
+    assert error.count("\n") == 1
+    assert "pickle" not in error
+    for read in (load_grid, KeepMask.load):
+        with pytest.raises((ValueError, OSError)) as caught:
+            read(source)
+        assert file_kind(source).name in str(caught.value)
+        assert "pickle" not in str(caught.value)
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_the_keep_mask_is_not_what_is_cleaned(cleaned, capsys):
+    folder, _, _ = cleaned
+    assert cli.main(["clean", str(folder / "g-keep.npz")]) == 2
+    assert "is a keep mask: name the file that was cleaned, and this one with --mask" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_cameras_that_nobody_uses_are_one_line(cleaned, tmp_path, capsys):
+    folder, _, _ = cleaned
+    frames = [{"file_path": f"{i}.png", "transform_matrix": np.eye(4).tolist()} for i in range(3)]
+    lens = {"w": 8, "h": 8, "fl_x": 8.0, "fl_y": 8.0, "cx": 4.0, "cy": 4.0, "camera_model": "OPENCV"}
+    (tmp_path / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
+    words = ["--cameras", str(tmp_path / "transforms.json"), "--keep", str(tmp_path / "k.npz")]
+    for denoiser, warned in (("default", True), ("views", False)):
+        clean(folder, *words, "--denoiser", denoiser)
+        error = capsys.readouterr().err
+        lines = [line for line in re.split(r"[\r\n]", error) if line.startswith("warning: clean: cameras are not used")]
+        assert len(lines) == warned
+        assert not warned or "--denoiser views" in lines[0]

@@ -49,8 +49,8 @@ def test_wrong_words_exit_with_two(words, capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["clean", "absent.npz"], "unghost clean: load_grid: no file absent.npz"),
-        (["clean", "absent.npz", "--cameras", "absent"], "unghost clean: load_cameras: no file absent"),
+        (["clean", "absent.npz"], "unghost clean: no file absent.npz"),
+        (["clean", "absent.PLY", "--cameras", "absent"], "unghost clean: no file absent.PLY"),
         (["curate", "absent", "--out", "x"], "unghost curate: load_recipe: absent is neither a file"),
         (["curate", "procedural", "--out", "x", "--count", "0"], "unghost curate: count must be >= 1, got 0"),
         (["train", "absent", "--out", "x"], "unghost train: find_shards: absent is not a shard and holds none"),
@@ -105,7 +105,7 @@ def test_grid_files_round_trip_and_refuse(tmp_path):
     assert density.shape == (2, 4, 6)
     np.testing.assert_array_equal(found, box)
     path.write_bytes(path.read_bytes()[:-40])
-    with pytest.raises(ValueError, match=r"g\.npz is not an \.npz file, or is truncated"):
+    with pytest.raises(ValueError, match=r"g\.npz is an \.npz or \.sog archive without its end"):
         load_grid(path)
     np.savez(path, density=np.ones((2, 2, 2)))
     with pytest.raises(ValueError, match="lacks aabb"):
