@@ -177,6 +177,28 @@ class Cameras:
         return [np.flatnonzero(which.reshape(-1) == group) for group in np.argsort(first)]
 
     @property
+    def canvas(self) -> tuple[int, int]:
+        """Height and width that hold every image: those of arrays of views that differ in size.
+
+        Such arrays hold each view in their upper left corner (:meth:`window`); what lies right of it and below is no
+        part of it.
+        """
+        if self.same_size:
+            return self.height, self.width
+        width, height = self.sizes.max(axis=0, initial=0)
+        return int(height), int(width)
+
+    def window(self, index: int | np.integer[Any]) -> tuple[slice, slice]:
+        """Rows and columns of one camera's image on the :attr:`canvas`."""
+        width, height = self.size(index)
+        return slice(0, height), slice(0, width)
+
+    @property
+    def shapes(self) -> list[tuple[int, int]]:
+        """Height and width of each image."""
+        return [(height, width) for width, height in self.sizes.tolist()]
+
+    @property
     def flat_sided(self) -> NDArray[np.bool_]:
         """``(N,)`` bool: pinholes, whose field of view has four flat sides."""
         return ~(self.fisheye | self.distortion.any(axis=1))

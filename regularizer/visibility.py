@@ -142,9 +142,9 @@ class ViewCounter:
 def _checked(
     depth_maps: NDArray[Any] | Sequence[NDArray[Any]], cameras: Cameras
 ) -> NDArray[Any] | Sequence[NDArray[Any]]:
-    """One array, or of cameras that differ in size a list of arrays; of the cameras' sizes."""
-    if cameras.same_size:
-        shape = (len(cameras), cameras.height, cameras.width)
+    """One array on the cameras' canvas, or of cameras that differ in size a list of arrays of their sizes."""
+    if cameras.same_size or isinstance(depth_maps, np.ndarray):
+        shape = (len(cameras), *cameras.canvas)
         if np.shape(depth_maps) != shape:
             raise InvalidArgument(f"ViewCounter: depth_maps must have shape {shape}, got {np.shape(depth_maps)}")
         return np.asarray(depth_maps)
