@@ -198,7 +198,7 @@ def render_view(
             found = values(rendering.positions.reshape(-1, 3)).view_as(rendering.weights)
             maps.append((rendering.weights * found).sum(1))
         parts.append((rgb, *maps))
-    shape = (cameras.height, cameras.width)
+    shape = cameras.shapes[index]
     color, *planes = (torch.cat(column).numpy() for column in zip(*parts))
     names = ("depth", "accumulation", "spread", "values")
     return {"rgb": color.reshape(*shape, 3), **{name: plane.reshape(shape) for name, plane in zip(names, planes)}}

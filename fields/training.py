@@ -64,6 +64,8 @@ def distortion_loss(rendering: Rendering) -> Tensor:
 def gather_rays(cameras: Cameras, images: NDArray[np.float32]) -> tuple[Tensor, Tensor, Tensor]:
     """All pixels of all photos: origins, unit directions, colours, each ``(pixels, 3)`` float32.
 
+    Photos that differ in size lie in the upper left corners of ``images`` (:attr:`Cameras.canvas`).
+
     Raises:
         ValueError: ``images`` is not ``(N, height, width, 3)`` for the N cameras, or not floating point.
 
@@ -73,16 +75,20 @@ def gather_rays(cameras: Cameras, images: NDArray[np.float32]) -> tuple[Tensor, 
         >>> directions.shape, bool((directions[:, 2] < 0).all())  # one ray a pixel, looking along -z
         (torch.Size([48, 3]), True)
     """
-    expected = (len(cameras), cameras.height, cameras.width, 3)
+    expected = (len(cameras), *cameras.canvas, 3)
     if images.shape != expected:
         raise InvalidArgument(f"gather_rays: images must have shape {expected}, got {images.shape}")
     if images.dtype.kind != "f":
         raise InvalidArgument(f"gather_rays: images must be floating point in [0, 1], got dtype {images.dtype}")
     rays = [cameras.rays(index) for index in range(len(cameras))]
     origins, directions = (np.concatenate([ray[part].reshape(-1, 3) for ray in rays]) for part in (0, 1))
+    if cameras.same_size:
+        pixels = images.reshape(-1, 3)
+    else:
+        views = [image[cameras.window(index)].reshape(-1, 3) for index, image in enumerate(images)]
+        pixels = np.concatenate(views)
     starts, towards, colors = (
-        torch.from_numpy(np.ascontiguousarray(item, dtype=np.float32))
-        for item in (origins, directions, images.reshape(-1, 3))
+        torch.from_numpy(np.ascontiguousarray(item, dtype=np.float32)) for item in (origins, directions, pixels)
     )
     return starts, towards, colors
 

@@ -60,8 +60,9 @@ class DensityRegularizer:
         denoiser: kind ``"numpy"`` or ``"torch"``. One that asks for the surroundings costs as many positions again.
         aabb: ``(2, 3)``, scene units: where to clean.
         cameras: of the training photos; None for no visibility loss; who sees a place is unknown then.
-        depth_maps: ``(cameras, height, width)`` of theirs, along the optical axis, inf for nothing: the visibility loss
-            then counts only cameras from which nothing hides a point (the paper: every camera that has it in view).
+        depth_maps: ``(cameras, height, width)`` of theirs (a list where they differ in size), along the optical axis,
+            inf for nothing: the visibility loss then counts only cameras from which nothing hides a point (the paper:
+            every camera that has it in view).
         field_pitch: side of the field's own cells in scene units, or a function of cube centres ``(N, 3)``
             that gives it as ``(N,)`` (a contracted field); None if unknown: then the cube's voxel.
         device: where positions are created; None for the device of the field's parameters, else the CPU.
@@ -91,7 +92,7 @@ class DensityRegularizer:
         *,
         aabb: ArrayLike,
         cameras: Cameras | None = None,
-        depth_maps: NDArray[np.floating] | None = None,
+        depth_maps: NDArray[np.floating] | Sequence[NDArray[np.floating]] | None = None,
         field_pitch: FieldPitch = None,
         device: torch.device | str | None = None,
         settings: RegularizerSettings | None = None,

@@ -1,7 +1,8 @@
 """Who sees what, settled a cell at a time: most of a scene is seen by enough fixed cameras, or by none, cell by cell.
 
-A cell wholly inside a frustum is seen by that camera, one wholly beyond a side of it is not. With distortion a
-frustum's sides are bent: each is put between two flat ones (the rectangles inside and about the undistorted image).
+A cell wholly inside a frustum is seen by that camera, one wholly beyond a side of it is not. With distortion, and all
+the more with a fisheye, a frustum's sides are bent: each is put between two flat ones (the rectangles inside and about
+the undistorted image, ``core/visibility/rectangles.py``).
 Cells in which cameras disagree are cut in eight, twice over; points in what is open then are held against the flat
 sides themselves, and the few that lie between the inner and the outer one are left to the exact test,
 :meth:`Cameras.sees`. Counting up to one view at 32,768 points with 100 cameras takes .3 ms (.6 ms with distortion),
@@ -15,10 +16,10 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.cameras import Cameras, distort, largest_radius, undistort
-from ..core.visibility.view_counts import BORDER_POINTS
+from ..core.cameras import Cameras
+from ..core.visibility.rectangles import image_rectangles as image_rectangles
+from ..core.visibility.rectangles import side_normals
 
-MOST_TANGENTIAL = 0.05  # of p1, p2: beyond, a lens may fold where its radial terms do not tell
 COARSEST, LEVELS = 8, 3  # cells along an axis at first, and in how many sizes: down to 32 along it
 CHUNK = 16384  # cells looked at together
 GROUP = 128  # cameras asked together: what enough of them see is not held against the others
@@ -28,54 +29,10 @@ OPEN = -1
 FloatArray = NDArray[np.float64]
 
 
-def image_rectangles(cameras: Cameras) -> tuple[FloatArray, FloatArray]:
-    """Normalised image coordinates (x right, y down) that a camera surely has in view, and those it may have.
-
-    Returns:
-        two ``(N, 4)``: left, right, top, bottom. Where the lens cannot be undistorted to its border, the first is
-        empty (NaN) and the second everything (infinite).
-    """
-    fx, fy, cx, cy = cameras.intrinsics.T
-    plain = np.stack([-cx / fx, (cameras.width - cx) / fx, -cy / fy, (cameras.height - cy) / fy], axis=1)
-    sure, possible = plain.copy(), plain.copy()
-    along, cache = np.linspace(0.0, 1.0, BORDER_POINTS), dict[bytes, tuple[FloatArray, FloatArray]]()
-    for index in np.flatnonzero(cameras.distortion.any(axis=1)):
-        key = cameras.intrinsics[index].tobytes() + cameras.distortion[index].tobytes()
-        if key not in cache:
-            cache[key] = _bent_rectangles(plain[index], cameras.distortion[index], along)
-        sure[index], possible[index] = cache[key]
-    return sure, possible
-
-
-def _bent_rectangles(plain: FloatArray, bend: FloatArray, along: FloatArray) -> tuple[FloatArray, FloatArray]:
-    left, right, top, bottom = plain
-    rows, columns = top + along * (bottom - top), left + along * (right - left)
-    x = np.stack([np.full_like(rows, left), np.full_like(rows, right), columns, columns])
-    y = np.stack([rows, rows, np.full_like(columns, top), np.full_like(columns, bottom)])
-    with np.errstate(over="ignore", invalid="ignore"):
-        u, v = undistort(x, y, bend)
-        missed = np.abs(np.stack(distort(u, v, bend)) - np.stack([x, y])).max()
-        radius = np.sqrt((u * u + v * v).max())
-    if not (missed < 1e-6 and np.abs(bend[4:]).max() <= MOST_TANGENTIAL and radius < 0.999 * largest_radius(bend)):
-        return np.full(4, np.nan), np.array([-np.inf, np.inf, -np.inf, np.inf])
-    sides = np.stack([u[0], u[1], v[2], v[3]])
-    margin = np.abs(np.diff(sides, n=2, axis=1)).max(axis=1) + 1e-6  # between two samples the border bends no further
-    low, high = sides.min(axis=1) - margin, sides.max(axis=1) + margin
-    sure = np.array([high[0], low[1], high[2], low[3]])
-    corner = np.hypot(np.abs(sure[:2]).max(), np.abs(sure[2:]).max())
-    possible = np.array([low[0], high[1], low[2], high[3]])
-    return (sure if corner < largest_radius(bend) else np.full(4, np.nan)), possible
-
-
 def _planes(cameras: Cameras, rectangles: FloatArray) -> NDArray[np.float32]:
     """``(4, N, 4)``: unit normal and offset of each side; a point ``(p, 1)`` is within it if the product is >= 0."""
-    bounded = np.isfinite(rectangles)
-    left, right, top, bottom = np.where(bounded, rectangles, 0.0).T
-    one, zero = np.ones_like(left), np.zeros_like(left)
-    local = np.array([[one, zero, left], [-one, zero, -right], [zero, -one, top], [zero, one, -bottom]])
-    local *= bounded.T[:, None]  # an unbounded side: 0 >= 0
-    normals = np.einsum("nab,sbn->sna", cameras.camera_to_world[:, :, :3], local)
-    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
+    normals = side_normals(cameras, rectangles).swapaxes(0, 1)  # an unbounded side is 0: 0 >= 0
+    normals = normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
     offsets = -np.einsum("sna,na->sn", normals, cameras.origins)
     return np.concatenate([normals, offsets[..., None]], axis=-1).astype(np.float32)
 

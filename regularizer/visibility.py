@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -94,7 +95,7 @@ class ViewCounter:
         min_views: where counting stops, >= 1.
         aabb: ``(2, 3)``, where most points will be; None for no cells.
         depth_maps: ``(cameras, height, width)`` depth along the optical axis, inf for nothing: a point that something
-            hides from a camera is not seen by it.
+            hides from a camera is not seen by it. Of cameras that differ in size, a list of ``(height, width)``.
         tolerance: relative, of that comparison.
     """
 
@@ -104,16 +105,13 @@ class ViewCounter:
         *,
         min_views: int = 1,
         aabb: ArrayLike | None = None,
-        depth_maps: NDArray[Any] | None = None,
+        depth_maps: NDArray[Any] | Sequence[NDArray[Any]] | None = None,
         tolerance: float = 0.05,
     ) -> None:
         if min_views < 1:
             raise InvalidArgument(f"ViewCounter: min_views must be >= 1, got {min_views}")
-        shape = (len(cameras), cameras.height, cameras.width)
-        if depth_maps is not None and np.shape(depth_maps) != shape:
-            raise InvalidArgument(f"ViewCounter: depth_maps must have shape {shape}, got {np.shape(depth_maps)}")
         self.min_views, self.tolerance = int(min_views), tolerance
-        self._depth = None if depth_maps is None else np.asarray(depth_maps)
+        self._depth = None if depth_maps is None else _checked(depth_maps, cameras)
         box = None if aabb is None else as_aabb(aabb, caller="ViewCounter")
         self._grid = None if box is None else ViewGrid(cameras, box, min_views=self.min_views)
         self._cameras = cameras
@@ -139,3 +137,25 @@ class ViewCounter:
             counts[open_] += seen
             open_ = open_[counts[open_] < self.min_views]
         return counts
+
+
+def _checked(
+    depth_maps: NDArray[Any] | Sequence[NDArray[Any]], cameras: Cameras
+) -> NDArray[Any] | Sequence[NDArray[Any]]:
+    """One array on the cameras' canvas, or of cameras that differ in size a list of arrays of their sizes."""
+    if cameras.same_size or isinstance(depth_maps, np.ndarray):
+        shape = (len(cameras), *cameras.canvas)
+        if np.shape(depth_maps) != shape:
+            raise InvalidArgument(f"ViewCounter: depth_maps must have shape {shape}, got {np.shape(depth_maps)}")
+        return np.asarray(depth_maps)
+    shapes = [np.shape(depth) for depth in depth_maps]
+    wanted = [(int(height), int(width)) for width, height in cameras.sizes]
+    if shapes != wanted:
+        wrong = next(
+            (k for k, pair in enumerate(zip(shapes, wanted)) if pair[0] != pair[1]), min(len(shapes), len(wanted))
+        )
+        raise InvalidArgument(
+            f"ViewCounter: depth_maps must be a map (height, width) for each of the {len(wanted)} cameras, "
+            f"got {len(shapes)}; the first that differs is number {wrong}"
+        )
+    return [np.asarray(depth) for depth in depth_maps]

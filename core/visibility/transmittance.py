@@ -32,7 +32,8 @@ class TransmittanceMaps:
 
     Attributes:
         cameras: those of the photos.
-        columns, rows: pixel coordinates ``(X,)`` and ``(Y,)`` of the rays, ascending.
+        columns, rows: pixel coordinates ``(X,)`` and ``(Y,)`` of the rays, ascending; ``(N, X)`` and ``(N, Y)`` of
+            cameras that differ in size.
         through: ``(N, Y, X, STEPS + 1)`` float32 in [0, 1], at distances ``0, step, 2 step, ...`` along a ray.
         step: ``(N,)``, scene units.
         clearance: scene units.
@@ -63,27 +64,24 @@ class TransmittanceMaps:
         """
         if not 0 < field_pitch < np.inf:
             raise InvalidArgument(f"TransmittanceMaps: field_pitch must be finite and > 0, got {field_pitch}")
-        columns, rows = (
-            np.unique(np.floor((np.arange(count) + 0.5) * size / count)).astype(np.int64)
-            for count, size in zip(FAN, (cameras.width, cameras.height))
-        )
+        across, down = _fan(cameras)
         corners = np.stack(np.meshgrid(*np.asarray(aabb, dtype=np.float64).T, indexing="ij"), axis=-1).reshape(-1, 3)
         reach = np.linalg.norm(corners[None] - cameras.origins[:, None], axis=2).max(axis=1, initial=0.0)
         step = reach / STEPS
-        through = np.ones((len(cameras), len(rows), len(columns), STEPS + 1), dtype=np.float32)
+        height, width = down.shape[-1], across.shape[-1]
+        through = np.ones((len(cameras), height, width, STEPS + 1), dtype=np.float32)
         for index in range(len(cameras)):
-            origins, directions = (part[np.ix_(rows, columns)].reshape(-1, 3) for part in cameras.rays(index))
+            origins, directions = _fan_rays(cameras, index, across, down)
             distance = (np.arange(STEPS) + 0.5) * step[index]
             points = (origins[:, None] + distance[:, None] * directions[:, None]).reshape(-1, 3).astype(np.float32)
             parts = [np.asarray(density_fn(points[i : i + QUERY])).reshape(-1) for i in range(0, len(points), QUERY)]
-            density = np.concatenate(parts).astype(np.float64).reshape(len(rows), len(columns), STEPS)
+            density = np.concatenate(parts).astype(np.float64).reshape(height, width, STEPS)
             if not (density >= 0).all():
                 raise InvalidArgument(
                     f"TransmittanceMaps: density must be >= 0, {int((~(density >= 0)).sum())} are not"
                 )
             depth = np.cumsum(np.minimum(density * step[index], 1e3), axis=2)
             through[index, ..., 1:] = np.exp(-depth)
-        across, down = (pixels.astype(np.float64) + 0.5 for pixels in (columns, rows))
         return cls(cameras, across, down, through, step, CLEARANCE * field_pitch)
 
     def best_view(self, positions: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -105,8 +103,34 @@ class TransmittanceMaps:
     def _look_up(self, index: int, pixels: NDArray[np.float64], distance: NDArray[np.float64]) -> NDArray[np.float32]:
         """Trilinear between the four rays about ``pixels (n, 2)`` and the two samples about ``distance (n,)``."""
         _, height, width, _ = self.through.shape
-        row = np.interp(pixels[:, 1], self.rows, np.arange(height))
-        column = np.interp(pixels[:, 0], self.columns, np.arange(width))
+        columns, rows = (each if each.ndim == 1 else each[index] for each in (self.columns, self.rows))
+        row = np.interp(pixels[:, 1], rows, np.arange(height))
+        column = np.interp(pixels[:, 0], columns, np.arange(width))
         places = np.stack([row, column, distance / self.step[index]], axis=1)
         result: NDArray[np.float32] = np.minimum(interpolate_grid(self.through[index], places), np.float32(1.0))
         return result
+
+
+def _fan(cameras: Cameras) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Pixel coordinates of the rays: across and down, at pixel centres unless the cameras differ in size."""
+    if not cameras.same_size:
+        across, down = ((np.arange(count) + 0.5) * size[:, None] / count for count, size in zip(FAN, cameras.sizes.T))
+        return across, down
+    columns, rows = (
+        np.unique(np.floor((np.arange(count) + 0.5) * size / count)) + 0.5
+        for count, size in zip(FAN, (cameras.width, cameras.height))
+    )
+    return columns, rows
+
+
+def _fan_rays(
+    cameras: Cameras, index: int, across: NDArray[np.float64], down: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Origins and directions ``(Y * X, 3)`` of one camera's rays, row by row."""
+    if not cameras.same_size:
+        pixels = np.stack(np.meshgrid(across[index], down[index]), axis=-1)
+        origins, directions = cameras.rays(index, pixels.reshape(-1, 2))
+        return origins, directions
+    rows, columns = (each.astype(np.int64) for each in (down, across))
+    origins, directions = (part[np.ix_(rows, columns)].reshape(-1, 3) for part in cameras.rays(index))
+    return origins, directions

@@ -9,8 +9,8 @@ from ..cameras import Cameras, distort, largest_radius, undistort
 from ..errors import InvalidArgument
 from ..frames import RESOLUTION, cube_lattices, unit_lattice
 from ..shards.storage import MAX_VIEW_COUNT
-
-BORDER_POINTS = 33  # along each side of an image, where a bent border is straightened
+from .rectangles import BORDER_POINTS as BORDER_POINTS
+from .rectangles import image_rectangles, side_normals
 
 
 def frustum_normals(cameras: Cameras) -> NDArray[np.float64]:
@@ -21,18 +21,19 @@ def frustum_normals(cameras: Cameras) -> NDArray[np.float64]:
     that ``d >= 0``. Likewise for the rows.
 
     Raises:
-        ValueError: a camera has distortion; its field of view has no flat sides.
+        ValueError: a camera has distortion or is a fisheye; its field of view has no flat sides.
     """
-    if cameras.distortion.any():
-        raise InvalidArgument("frustum_normals: cameras must have no distortion")
+    if not cameras.flat_sided.all():
+        raise InvalidArgument("frustum_normals: cameras must have no distortion and be no fisheyes")
+    width, height = cameras.sizes.T
     fx, fy, cx, cy = cameras.intrinsics.T
     zero = np.zeros_like(fx)
     local = np.array(
         [
             [fx, zero, -cx],
-            [-fx, zero, cx - cameras.width],
+            [-fx, zero, cx - width],
             [zero, -fy, -cy],
-            [zero, fy, cy - cameras.height],
+            [zero, fy, cy - height],
         ]
     )
     normals: NDArray[np.float64] = np.einsum("nab,sbn->nsa", cameras.camera_to_world[:, :, :3], local)
@@ -54,10 +55,10 @@ def count_views(
         centers, edges, rotations: ``(N, 3)``, ``(N,)``, ``(N, 3, 3)``, scene units.
     """
     counts = np.zeros((len(centers), *(RESOLUTION,) * 3), dtype=np.int64)
-    if cameras.distortion.any():
-        for index in range(len(centers)):
-            counts[index] = cameras.view_count(cube_lattices(centers[[index]], edges[[index]], rotations[[index]])[0])
-        return np.minimum(counts, MAX_VIEW_COUNT).astype(np.uint8)
+    flat = cameras.flat_sided
+    if not flat.all():
+        _add_bent(counts, cameras.select(np.flatnonzero(~flat)), centers, edges, rotations)
+        cameras = cameras.select(np.flatnonzero(flat))
     normals, axis = frustum_normals(cameras), unit_lattice()[:, 0, 0, 0]
     for index, (center, edge, rotation) in enumerate(zip(centers, edges, rotations)):
         middle = ((center - cameras.origins)[:, None] * normals).sum(axis=-1)  # (cameras, 4): value at the centre
@@ -72,19 +73,51 @@ def count_views(
     return np.minimum(counts, MAX_VIEW_COUNT).astype(np.uint8)
 
 
+def _add_bent(
+    counts: NDArray[np.int64],
+    cameras: Cameras,
+    centers: NDArray[np.float64],
+    edges: NDArray[np.float64],
+    rotations: NDArray[np.float64],
+) -> None:
+    """Add the views of cameras whose field of view has bent sides to ``counts (N, 32, 32, 32)``.
+
+    Cubes within the rectangle inside the image, or beyond one about it, are settled at once; of the others every voxel
+    is projected.
+    """
+    sure, possible = image_rectangles(cameras)
+    reliable = np.isfinite(sure).all(axis=1)
+    inner, outer = side_normals(cameras, sure), side_normals(cameras, possible)
+    furthest = unit_lattice()[-1, 0, 0, 0]
+    for index, (center, edge, rotation) in enumerate(zip(centers, edges, rotations)):
+        away, lattice = (center - cameras.origins)[:, None], None
+        bounds = []
+        for normals in (inner, outer):
+            middle = (away * normals).sum(axis=-1)
+            bounds.append((middle, np.abs(normals @ rotation * edge).sum(axis=-1) * furthest))
+        within = reliable & (bounds[0][0] - bounds[0][1] > 0).all(axis=1)
+        counts[index] += within.sum()
+        for camera in np.flatnonzero(~within & (bounds[1][0] + bounds[1][1] >= 0).all(axis=1)):
+            if lattice is None:
+                lattice = cube_lattices(centers[[index]], edges[[index]], rotations[[index]])[0]
+            counts[index] += cameras.project(int(camera), lattice)[2]
+
+
 def pinholes(cameras: Cameras) -> Cameras:
     """The same cameras without distortion, each border of the image put where its points lie on average.
 
     With a bent border there are no flat sides, and counting is slow. Straightening moves a border by a share of the
     image that a wide lens shows and a phone hardly does; nothing else is approximated. Cameras without distortion,
-    and lenses so wide that their border cannot be undistorted, are returned as they are.
+    fisheyes, and lenses so wide that their border cannot be undistorted, are returned as they are.
     """
-    if not cameras.distortion.any():
+    straight = ~cameras.fisheye
+    if not cameras.distortion[straight].any():
         return cameras
     along = np.linspace(0.0, 1.0, BORDER_POINTS)
-    intrinsics = np.empty_like(cameras.intrinsics)
-    for index, ((fx, fy, cx, cy), bend) in enumerate(zip(cameras.intrinsics, cameras.distortion)):
-        columns, rows = (along * cameras.width - cx) / fx, (along * cameras.height - cy) / fy
+    intrinsics, distortion = cameras.intrinsics.copy(), cameras.distortion.copy()
+    for index in np.flatnonzero(straight):
+        (fx, fy, cx, cy), bend, (width, height) = cameras.intrinsics[index], distortion[index], cameras.size(index)
+        columns, rows = (along * width - cx) / fx, (along * height - cy) / fy
         x = np.stack([np.full_like(rows, columns[0]), np.full_like(rows, columns[-1]), columns, columns])
         y = np.stack([rows, rows, np.full_like(columns, rows[0]), np.full_like(columns, rows[-1])])
         with np.errstate(over="ignore", invalid="ignore"):
@@ -94,8 +127,8 @@ def pinholes(cameras: Cameras) -> Cameras:
             if not (good and (u * u + v * v < largest_radius(bend) ** 2).all()):
                 return cameras
         left, right, top, bottom = u[0].mean(), u[1].mean(), v[2].mean(), v[3].mean()
-        fx, fy = cameras.width / (right - left), cameras.height / (bottom - top)
+        fx, fy = width / (right - left), height / (bottom - top)
         intrinsics[index] = fx, fy, -left * fx, -top * fy
-    return Cameras(
-        cameras.camera_to_world, intrinsics, cameras.width, cameras.height, np.zeros_like(cameras.distortion)
-    )
+    distortion[straight] = 0.0
+    widths, heights = (cameras.width, cameras.height) if cameras.same_size else cameras.sizes.T
+    return Cameras(cameras.camera_to_world, intrinsics, widths, heights, distortion, cameras.fisheye)

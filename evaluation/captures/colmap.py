@@ -20,6 +20,10 @@ LENSES = {  # COLMAP's camera models -> their parameters in order, by the names 
     "SIMPLE_RADIAL": ("fl_x", "cx", "cy", "k1"),
     "RADIAL": ("fl_x", "cx", "cy", "k1", "k2"),
     "OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "FULL_OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),  # the last three 0
+    "SIMPLE_RADIAL_FISHEYE": ("fl_x", "cx", "cy", "k1"),
+    "RADIAL_FISHEYE": ("fl_x", "cx", "cy", "k1", "k2"),
+    "OPENCV_FISHEYE": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4"),
 }
 PLACES = ("", "sparse", "colmap/sparse")  # where a model may be below the folder of a capture
 
@@ -86,7 +90,8 @@ def read_model(folder: str | Path, *, prefix: str = "") -> dict[str, Any]:
     Raises:
         ImportError: pycolmap is missing.
         ValueError: no model, a broken one, one without posed photos, or a camera model other than SIMPLE_PINHOLE,
-            PINHOLE, SIMPLE_RADIAL, RADIAL or OPENCV.
+            PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV with k4 = k5 = k6 = 0, SIMPLE_RADIAL_FISHEYE,
+            RADIAL_FISHEYE or OPENCV_FISHEYE.
     """
     source = Path(folder)
     ending = _ending(source)
@@ -105,7 +110,8 @@ def read_model(folder: str | Path, *, prefix: str = "") -> dict[str, Any]:
     photos = sorted((each for each in model.images.values() if each.has_pose), key=lambda each: each.name)
     if not photos:
         raise InvalidFile(f"read_model: {source} has no photo with a pose")
-    lenses = {number: _lens(camera, source) for number, camera in model.cameras.items()}
+    used = {photo.camera_id for photo in photos}
+    lenses = {number: lens_of(camera, source) for number, camera in model.cameras.items() if number in used}
     frames = []
     for photo in photos:
         pose = photo.cam_from_world().inverse().matrix() * np.array([1.0, -1.0, -1.0, 1.0])
@@ -113,8 +119,12 @@ def read_model(folder: str | Path, *, prefix: str = "") -> dict[str, Any]:
     return {"frames": frames}
 
 
-def _lens(camera: Any, source: Path) -> dict[str, Any]:
-    """One camera's part of a frame."""
+def lens_of(camera: Any, source: Path) -> dict[str, Any]:
+    """One ``pycolmap.Camera``'s part of a frame.
+
+    Raises:
+        ValueError: its model is not read.
+    """
     model = camera.model.name
     if model not in LENSES:
         raise InvalidFile(
@@ -122,4 +132,9 @@ def _lens(camera: Any, source: Path) -> dict[str, Any]:
             "undistort the photos first (colmap image_undistorter)"
         )
     values = dict(zip(LENSES[model], (float(value) for value in camera.params), strict=True))
-    return {"w": int(camera.width), "h": int(camera.height), "fl_y": values["fl_x"], **values}
+    if model == "FULL_OPENCV" and any(values[key] for key in ("k4", "k5", "k6")):
+        raise InvalidFile(
+            f"read_model: camera {camera.camera_id} of {source} is a FULL_OPENCV with k4, k5, k6 other than 0; "
+            "undistort the photos first (colmap image_undistorter)"
+        )
+    return {"camera_model": model, "w": int(camera.width), "h": int(camera.height), "fl_y": values["fl_x"], **values}

@@ -1,6 +1,6 @@
 """Captures: posed photos as ``transforms.json`` or a COLMAP model describes them, and named sweeps of them.
 
-OpenGL camera-to-world matrices, a pinhole with OPENCV distortion, intrinsics for all photos or for each. Needs Pillow
+OpenGL camera-to-world matrices, OPENCV or OPENCV_FISHEYE lenses, one for all photos or one for each. Needs Pillow
 (``pip install unghost[eval]``), and pycolmap for COLMAP (``unghost[capture]``).
 """
 
@@ -88,19 +88,27 @@ class Capture:
     def images(self, indices: Iterable[int] | slice | None = None) -> NDArray[np.float32]:
         """Photos as ``(n, height, width, 3)`` float32 in [0, 1] (sRGB as stored), box-filtered to the cameras' size.
 
-        Read when first asked for, then kept. None means all of them.
+        Read when first asked for, then kept. None means all of them. Photos of different sizes make no array: ask for
+        one size at a time (:meth:`~unghost.core.cameras.Cameras.by_size`).
 
         Raises:
-            ValueError: a photo cannot be decoded, or has transparent pixels.
+            ValueError: a photo cannot be decoded, or has transparent pixels; photos of different sizes.
             IndexError: an index outside the capture.
         """
         everything = np.arange(len(self))
         chosen = everything if indices is None else np.atleast_1d(everything[_as_index(indices)])
+        sizes = sorted({self.cameras.size(index) for index in chosen.tolist()})
+        if len(sizes) > 1:
+            raise InvalidArgument(
+                f"Capture.images: the photos differ in size ({', '.join('{} x {}'.format(*size) for size in sizes)}); "
+                "ask for one size at a time: capture.images(group) for group in capture.cameras.by_size()"
+            )
         for index in chosen.tolist():
             if index not in self._cache:
-                self._cache[index] = _read_photo(self._paths[index], self.cameras.width, self.cameras.height)
-        shape = (0, self.cameras.height, self.cameras.width, 3)
-        return np.stack([self._cache[index] for index in chosen.tolist()]) if len(chosen) else np.zeros(shape, "f4")
+                self._cache[index] = _read_photo(self._paths[index], *sizes[0])
+        if not len(chosen):
+            return np.zeros((0, *self.cameras.sizes[0, ::-1], 3), "f4")
+        return np.stack([self._cache[index] for index in chosen.tolist()])
 
 
 def _as_index(indices: Iterable[int] | slice) -> Any:
@@ -167,15 +175,11 @@ def load_capture(
     here = [number for number, path in enumerate(found) if path is not None]
     frames, names, poses = [frames[k] for k in here], tuple(names[k] for k in here), poses[here]
     paths = tuple(path for path in found if path is not None)
-    sizes = {_check_photo(path, frame, name, label) for path, frame, name in zip(paths, frames, names)}
-    if len(sizes) != 1:
-        raise InvalidFile(f"load_capture: photos must all have one size, got {sorted(sizes)}")
-    width, height = sizes.pop()
-    lens, bend = (np.stack(values) for values in zip(*(read_lens(*each, width, height) for each in zip(frames, names))))
+    sizes = [_check_photo(path, frame, name, label) for path, frame, name in zip(paths, frames, names)]
     sweeps = resolve_splits(names, meta=meta, folder=root, given=splits, dropped=dropped)
     transform = _normalisation(poses[:, :3, 3], normalize, sweeps)
     poses[:, :3, 3] = poses[:, :3, 3] * transform[0, 0] + transform[:3, 3]
-    cameras = Cameras.create(poses, lens, width, height, bend).resized(1.0 / downscale)
+    cameras = _cameras(poses, frames, names, sizes).resized(1.0 / downscale)
     return Capture(source, names, cameras, sweeps, transform, float(transform[0, 0]), paths, dropped=dropped)
 
 
@@ -183,7 +187,8 @@ def load_cameras(path: str | Path) -> Cameras:
     """The cameras of a ``transforms.json`` or a COLMAP model alone, in its own world: no photo need be there.
 
     Args:
-        path: the file, or a folder that holds one, or a model. It must state ``w`` and ``h`` (for all frames alike).
+        path: the file, or a folder that holds one, or a model. It must state ``w`` and ``h``, for all
+            frames or for each.
 
     Example:
         >>> import json, tempfile
@@ -204,13 +209,29 @@ def load_cameras(path: str | Path) -> Cameras:
         raise MissingFile(f"load_cameras: no file {file}")
     meta = read_object(file) if file.is_file() else _source(Path(path))[0]
     merged, names, poses = read_frames(meta, str(file))
-    sizes = {f"{body.get('w')} x {body.get('h')}" for body in merged}
-    stated: list[Any] = [merged[0].get("w"), merged[0].get("h")]
-    if len(sizes) > 1 or not all(isinstance(side, (int, float)) and 1 <= side < np.inf for side in stated):
-        raise InvalidFile(f"load_cameras: {file} must state one w and h in pixels for all frames, got {sorted(sizes)}")
-    width, height = (int(side) for side in stated)
-    lens, bend = (np.stack(values) for values in zip(*(read_lens(*each, width, height) for each in zip(merged, names))))
-    return Cameras.create(poses, lens, width, height, bend)
+    stated: list[Any] = [(body.get("w"), body.get("h")) for body in merged]
+    for name, size in zip(names, stated):
+        if not all(isinstance(side, (int, float)) and 1 <= side < np.inf for side in size):
+            told = f"{size[0]} x {size[1]} for {name}"
+            raise InvalidFile(f"load_cameras: {file} must state one w and h in pixels for each frame, got {told}")
+    return _cameras(poses, merged, names, [(int(width), int(height)) for width, height in stated])
+
+
+def _cameras(
+    poses: NDArray[np.float64],
+    frames: Sequence[Mapping[str, Any]],
+    names: Sequence[str],
+    sizes: Sequence[tuple[int, int]],
+) -> Cameras:
+    """The cameras of frames whose photos have these sizes (width, height)."""
+    if any(frame.get("fisheye_crop_radius") for frame in frames):
+        warnings.warn(
+            "load_capture: fisheye_crop_radius is not read: pixels beyond it count as part of the photos", stacklevel=3
+        )
+    lenses = [read_lens(frame, name, *size) for frame, name, size in zip(frames, names, sizes, strict=True)]
+    lens, bend, fisheye = (np.stack(values) for values in zip(*lenses))
+    width, height = np.array(sizes).T
+    return Cameras.create(poses, lens, width, height, bend, fisheye)
 
 
 def _source(folder: Path) -> tuple[dict[str, Any], str, Path]:

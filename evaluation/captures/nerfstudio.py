@@ -59,8 +59,7 @@ def write_nerfstudio(
         raise InvalidArgument(
             f"write_nerfstudio: both sweeps need photos, got {len(sweeps['train'])} and {len(sweeps['eval'])}"
         )
-    size = (capture.cameras.width, capture.cameras.height)
-    if (capture.transform != np.eye(4)).any() or capture.photo_size(0) != size:
+    if (capture.transform != np.eye(4)).any() or capture.photo_size(0) != capture.cameras.size(0):
         raise InvalidArgument("write_nerfstudio: capture must be read with downscale=1 and normalize=False")
     with new_folder(target) as partial:
         chosen = sorted({*sweeps["train"], *sweeps["eval"]})

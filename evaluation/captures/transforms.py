@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.cameras import Cameras
-from ...core.errors import InvalidFile
+from ...core.errors import InvalidArgument, InvalidFile
 from ...core.io import read_json, write_json
 
 DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
@@ -22,6 +22,24 @@ BENDS = {  # camera model -> what may differ from 0 in it
     "SIMPLE_PINHOLE": (),
     "SIMPLE_RADIAL": ("k1",),
     "RADIAL": ("k1", "k2"),
+    "FULL_OPENCV": ("k1", "k2", "k3", "p1", "p2"),  # without its k4, k5, k6, which divide
+}
+FISHEYES = {  # the equidistant models, OPENCV_FISHEYE with fewer parameters, by the same names
+    "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
+    "RADIAL_FISHEYE": ("k1", "k2"),
+    "SIMPLE_RADIAL_FISHEYE": ("k1",),
+}
+UNREAD = {  # what instant-ngp and others say of lenses that are not read here
+    "ftheta_p0": "an f-theta lens",
+    "ftheta_p1": "an f-theta lens",
+    "latlong": "a panorama",
+    "is_latlong": "a panorama",
+    "equirectangular": "a panorama",
+    "is_equirectangular": "a panorama",
+    "orthographic": "no perspective",
+    "rolling_shutter": "a pose for each row",
+    "k5": "a lens with more distortion than k1 to k4",
+    "k6": "a lens with more distortion than k1 to k4",
 }
 
 
@@ -100,27 +118,78 @@ def _pose(frame: Mapping[str, Any], name: str) -> NDArray[np.float64]:
 
 def read_lens(
     frame: Mapping[str, Any], name: str, width: int, height: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Intrinsics ``(4,)`` in pixels and OPENCV distortion ``(6,)`` of one frame of :func:`read_frames`.
+) -> tuple[NDArray[np.float64], NDArray[np.float64], bool]:
+    """The lens of one frame of :func:`read_frames`.
+
+    ``camera_model`` is nerfstudio's, ``is_fisheye`` instant-ngp's; ``distortion_params`` is nerfstudio's other way to
+    say k1, k2, k3, k4, p1, p2. Without ``fl_x`` the field of view is taken: ``camera_angle_x`` in radians, ``x_fov`` in
+    degrees.
+
+    Returns:
+        intrinsics ``(4,)`` in pixels, distortion ``(6,)``, and whether the lens is OPENCV_FISHEYE instead of OPENCV.
 
     Raises:
         ValueError: a camera model that is not understood, or numbers that make no lens.
     """
-    model = frame.get("camera_model", "OPENCV")
-    if model not in BENDS:
-        raise InvalidFile(f"load_capture: camera_model {model!r} of {name} is none of {', '.join(BENDS)}")
-    focal = frame.get("fl_x")
-    if focal is None and "camera_angle_x" in frame:
-        focal = 0.5 * width / np.tan(0.5 * float(frame["camera_angle_x"]))
-    if focal is None:
-        raise InvalidFile(f"load_capture: neither fl_x nor camera_angle_x is given for {name}")
-    lens = np.array([focal, frame.get("fl_y", focal), frame.get("cx", width / 2), frame.get("cy", height / 2)], "f8")
-    bend = np.array([frame.get(key, 0.0) for key in DISTORTION_KEYS], dtype=np.float64)
+    fisheye = _is_fisheye(frame, name)
+    model = frame.get("camera_model") or ("OPENCV_FISHEYE" if fisheye else "OPENCV")
+    focal_x = _focal(frame, name, "x", width, fisheye)
+    if focal_x is None:
+        told = "no fl_x" if fisheye else "neither fl_x nor camera_angle_x nor x_fov"
+        raise InvalidFile(f"load_capture: {told} is given for {name}")
+    focal_y = _focal(frame, name, "y", height, fisheye)
+    center = frame.get("cx", width / 2), frame.get("cy", height / 2)
+    lens = np.array([focal_x, focal_x if focal_y is None else focal_y, *center], "f8")
+    bend = np.array(_distortion(frame, name), dtype=np.float64)
     if not (np.isfinite(lens).all() and np.isfinite(bend).all() and (lens[:2] > 0).all()):
         raise InvalidFile(f"load_capture: intrinsics of {name} must be finite with fl_x, fl_y > 0, got {lens.tolist()}")
-    if any(value and key not in BENDS[model] for key, value in zip(DISTORTION_KEYS, bend)):
+    if any(value and key not in {**BENDS, **FISHEYES}[model] for key, value in zip(DISTORTION_KEYS, bend)):
         raise InvalidFile(f"load_capture: {name} has distortion {bend.tolist()} but camera_model {model}")
-    return lens, bend
+    return lens, bend, fisheye
+
+
+def _is_fisheye(frame: Mapping[str, Any], name: str) -> bool:
+    """Whether a frame's lens is an OPENCV_FISHEYE; what is no lens that is read is refused by its name."""
+    model, flag = frame.get("camera_model"), frame.get("is_fisheye")
+    if model and not (isinstance(model, str) and (model in BENDS or model in FISHEYES)):
+        raise InvalidFile(
+            f"load_capture: camera_model {model!r} of {name} is none of {', '.join([*BENDS, *FISHEYES])}; "
+            "undistort the photos first"
+        )
+    for key, kind in UNREAD.items():
+        value = frame.get(key)
+        if any(value) if isinstance(value, list) else value:
+            raise InvalidFile(
+                f"load_capture: {name} has {key} {frame[key]!r}, {kind}, which is not read; undistort the photos first"
+            )
+    if flag is not None and not isinstance(flag, (bool, int)):
+        raise InvalidFile(f"load_capture: is_fisheye of {name} must be true or false, got {flag!r}")
+    if model and flag is not None and bool(flag) != (model in FISHEYES):
+        raise InvalidFile(f"load_capture: {name} has is_fisheye {bool(flag)} but camera_model {model}: which is it?")
+    return bool(flag) or model in FISHEYES
+
+
+def _focal(frame: Mapping[str, Any], name: str, axis: str, side: int, fisheye: bool) -> float | None:
+    """Focal length along an axis in pixels; None if nothing tells it."""
+    if frame.get(f"fl_{axis}") is not None:
+        return float(frame[f"fl_{axis}"])
+    angles = {f"{axis}_fov": np.pi / 180, f"camera_angle_{axis}": 1.0}
+    key = next((key for key in angles if frame.get(key) is not None), None)
+    if key is None:
+        return None
+    if fisheye:
+        raise InvalidFile(f"load_capture: {name} is a fisheye and needs fl_{axis} in pixels; {key} is a pinhole's")
+    return float(0.5 * side / np.tan(0.5 * float(frame[key]) * angles[key]))
+
+
+def _distortion(frame: Mapping[str, Any], name: str) -> list[Any]:
+    """k1, k2, k3, k4, p1, p2, each 0 unless given."""
+    values = frame.get("distortion_params")
+    if values is None:
+        return [frame.get(key, 0.0) for key in DISTORTION_KEYS]
+    if not isinstance(values, list) or len(values) != len(DISTORTION_KEYS):
+        raise InvalidFile(f"load_capture: distortion_params of {name} must be k1, k2, k3, k4, p1, p2, got {values!r}")
+    return values
 
 
 def write_transforms(
@@ -129,7 +198,7 @@ def write_transforms(
     """Write the file that stock nerfstudio (1.1.5) reads, whole or not at all.
 
     Lenses that are all the same stand once: nerfstudio lets a shared value win over a frame's own. Others stand with
-    each frame, and then none is shared.
+    each frame, and then none is shared; likewise the sizes.
 
     Args:
         path: of the file.
@@ -137,19 +206,27 @@ def write_transforms(
         names: of the photos, relative to the file's folder.
         lists: ``train_filenames`` and so on; nerfstudio wants train, val and test, or none of them.
         **extra: further keys of the file.
+
+    Raises:
+        ValueError: some of the cameras are fisheyes and others are not: such a file has one camera model.
     """
     keys = (*LENS_KEYS, *DISTORTION_KEYS)
+    if cameras.fisheye.any() and not cameras.fisheye.all():
+        raise InvalidArgument(
+            f"write_transforms: {int(cameras.fisheye.sum())} of the {len(cameras)} cameras are fisheyes and the others "
+            "are not, but nerfstudio reads one camera_model a file; write each kind alone, or undistort the fisheyes"
+        )
     lenses = np.concatenate([cameras.intrinsics, cameras.distortion], axis=1)
     alike = bool((lenses == lenses[:1]).all())
     frames: list[dict[str, Any]] = []
-    for name, pose, lens in zip(names, cameras.camera_to_world, lenses, strict=True):
-        own = {} if alike else dict(zip(keys, lens.tolist()))
+    for name, pose, lens, size in zip(names, cameras.camera_to_world, lenses, cameras.sizes.tolist(), strict=True):
+        own = {} if cameras.same_size else dict(zip("wh", size))
+        own |= {} if alike else dict(zip(keys, lens.tolist()))
         frames.append({"file_path": name, **own, "transform_matrix": [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]]})
     shared = dict(zip(keys, lenses[0].tolist())) if alike else {}
     content = {
-        "camera_model": "OPENCV",
-        "w": cameras.width,
-        "h": cameras.height,
+        "camera_model": "OPENCV_FISHEYE" if cameras.fisheye.any() else "OPENCV",
+        **({"w": cameras.width, "h": cameras.height} if cameras.same_size else {}),
         **shared,
         **extra,
         **{key: list(files) for key, files in lists.items()},

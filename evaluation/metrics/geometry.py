@@ -68,10 +68,9 @@ def backproject(depth: NDArray[Any], cameras: Cameras, index: int) -> FloatArray
         >>> (backproject(np.full((3, 3), 2.0), cameras, 0)[1, 1] + 0.0).tolist()
         [0.0, 0.0, -2.0]
     """
-    if depth.shape != (cameras.height, cameras.width):
-        raise InvalidArgument(
-            f"backproject: depth must have shape {(cameras.height, cameras.width)}, got {depth.shape}"
-        )
+    wanted = cameras.size(index)[::-1]
+    if depth.shape != wanted:
+        raise InvalidArgument(f"backproject: depth must have shape {wanted}, got {depth.shape}")
     origins, directions = cameras.rays(index)
     reachable = np.where(np.isfinite(depth), depth, np.nan).astype(np.float64)
     return origins + reachable[..., None] * directions

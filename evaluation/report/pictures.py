@@ -87,11 +87,13 @@ def view_pictures(
     result = []
     for name in names:
         index = position[name]
-        photo = truth.photos[index]
-        shown = {PHOTO: jpeg(photo)} | {each.name: jpeg(each.renders.colours[index]) for each in methods}
+        window = truth.window(index)
+        photo = truth.photos[index][window]
+        rendered = {each.name: each.renders.colours[index][window] for each in methods}
+        shown = {PHOTO: jpeg(photo)} | {method: jpeg(picture) for method, picture in rendered.items()}
         errors = {
-            each.name: jpeg(error_picture(each.renders.colours[index], photo, masks[each.name][index]))
-            for each in methods
+            method: jpeg(error_picture(picture, photo, masks[method][index][window]))
+            for method, picture in rendered.items()
         }
         captions = {each.name: _caption(scores[each.name][name], keys) for each in methods}
         result.append(ViewPictures(name, shown, errors, captions, max(photo.shape[:2]) <= COARSE))

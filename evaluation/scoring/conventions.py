@@ -238,7 +238,8 @@ def claimed_masks(convention: Convention, renders: Renders, truth: Truth, extent
         masks &= depth_masks(renders.depth, limit)
     if convention.accumulation is not None and renders.accumulation is not None:
         masks &= predicted_mask(renders.accumulation, threshold=convention.accumulation)
-    return masks
+    inside = truth.inside()
+    return masks if inside is None else masks & inside
 
 
 def one_convention(caller: str, rows: Iterable[Mapping[str, Any]]) -> Any:

@@ -1,4 +1,7 @@
-"""Depth along a pixel's unit ray, and depth along the camera's optical axis."""
+"""Depth along a pixel's unit ray, and depth along the camera's optical axis.
+
+Views that differ in size stand on one canvas (:attr:`~unghost.core.cameras.Cameras.canvas`).
+"""
 
 from __future__ import annotations
 
@@ -22,8 +25,11 @@ def ray_depth(depth: NDArray[Any], cameras: Cameras) -> NDArray[np.float64]:
 
 
 def _cosines(caller: str, depth: NDArray[Any], cameras: Cameras) -> NDArray[np.float64]:
-    """Of each pixel's ray with the optical axis ``(n, H, W)``."""
-    shape = (len(cameras), cameras.height, cameras.width)
+    """Of each pixel's ray with the optical axis ``(n, H, W)``; 1 beside a view that is smaller than the canvas."""
+    shape = (len(cameras), *cameras.canvas)
     if np.shape(depth) != shape:
         raise InvalidArgument(f"{caller}: depth must have shape {shape}, got {np.shape(depth)}")
-    return np.stack([cameras.rays(index)[1] @ -cameras.camera_to_world[index, :, 2] for index in range(len(cameras))])
+    cosines = np.ones(shape)
+    for index in range(len(cameras)):
+        cosines[index][cameras.window(index)] = cameras.rays(index)[1] @ -cameras.camera_to_world[index, :, 2]
+    return cosines

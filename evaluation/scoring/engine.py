@@ -144,10 +144,11 @@ def score_scene(
     wanted = tuple(key for key in wanted if key not in notes)
     rows = []
     for index, name in enumerate(truth.names):
-        row: dict[str, Any] = {"name": name, "pixels": int(masks[index].sum()), **dict.fromkeys(rule.keys)}
-        row.update(_image_scores(rule, renders, truth, masks[index], index, wanted, network, pixels_per_degree))
-        row.update(_geometry_scores(rule, renders, truth, masks[index], index, wanted, extent))
-        row.update(_mask_columns(rule, truth, masks[index], claimed[index], index, wanted))
+        mask, surface = (each[index][truth.window(index)] for each in (masks, claimed))
+        row: dict[str, Any] = {"name": name, "pixels": int(mask.sum()), **dict.fromkeys(rule.keys)}
+        row.update(_image_scores(rule, renders, truth, mask, index, wanted, network, pixels_per_degree))
+        row.update(_geometry_scores(rule, renders, truth, mask, index, wanted, extent))
+        row.update(_mask_columns(rule, truth, mask, surface, index, wanted))
         rows.append({key: _none_if_nan(value) for key, value in row.items()})
     used = network.backbone if network is not None and "lpips" in wanted else None
     return SceneScores(convention, tuple(rows), notes, used)
@@ -248,7 +249,8 @@ def _image_scores(
     network: Lpips | None,
     pixels_per_degree: float,
 ) -> dict[str, float]:
-    preds, target = (_through_bits(images[index], rule.bits) for images in (renders.colours, truth.photos))
+    window = truth.window(index)
+    preds, target = (_through_bits(images[index][window], rule.bits) for images in (renders.colours, truth.photos))
     result: dict[str, float] = {}
     if "psnr" in wanted:
         result["psnr"] = metrics.psnr(preds, target, mask, data_range=DATA_RANGE, convention=rule.psnr)
@@ -278,7 +280,10 @@ def _geometry_scores(
     extent: SceneExtent | None,
 ) -> dict[str, float]:
     result: dict[str, float] = {}
-    depth, pseudo = (None if each.depth is None else each.depth[index].astype(np.float64) for each in (renders, truth))
+    window = truth.window(index)
+    depth, pseudo = (
+        None if each.depth is None else each.depth[index][window].astype(np.float64) for each in (renders, truth)
+    )
     surface = pseudo
     if pseudo is not None and rule.clipped_depth and extent is not None:
         surface = np.where(pseudo < extent.limit, pseudo, np.inf)  # no normal where it is cut
@@ -291,7 +296,7 @@ def _geometry_scores(
             result["disparity_mae"] = metrics.disparity_mae(depth, pseudo, mask)
     if any(key in wanted for key in NORMAL_KEYS):
         first, second = (
-            view_normals(None if views.normals is None else views.normals[index], each, truth.cameras, index)
+            view_normals(None if views.normals is None else views.normals[index][window], each, truth.cameras, index)
             for views, each in ((renders, depth), (truth, surface))
         )
         if first is not None and second is not None:
@@ -305,7 +310,7 @@ def _mask_columns(
     rule: Convention, truth: Truth, mask: Mask, claimed: Mask, index: int, wanted: Sequence[str]
 ) -> dict[str, float]:
     result: dict[str, float] = {}
-    visible = None if truth.visible is None else truth.visible[index]
+    visible = None if truth.visible is None else truth.visible[index][truth.window(index)]
     if "coverage" in wanted:
         if rule.coverage_of == "all":
             result["coverage"] = metrics.coverage(mask)

@@ -198,7 +198,7 @@ def _read(name: str, given: OneMethod, truth: Truth) -> Method:
         return given
     if isinstance(given, Renders):
         return Method(name, given)
-    return read_method(name, given, truth.names, (truth.photos.shape[1], truth.photos.shape[2]))
+    return read_method(name, given, truth.names, truth.shapes)
 
 
 def _along_rays(method: Method, truth: Truth, depth_along: str) -> Method:

@@ -16,8 +16,8 @@ from ..captures.loading import load_capture
 from ..captures.splits import EVAL_NAMES, TRAIN_NAMES, choose_split
 from .conventions import SceneExtent
 from .pseudo_truth import PseudoTruth, check_cameras, load_pseudo_truth
-from .renders import match_names, read_masks, read_photos
-from .views import Truth
+from .renders import match_names, read_masks, read_sized_photos
+from .views import Truth, pad_views
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,13 +45,14 @@ class _Photos:
 
     names: tuple[str, ...]
     photos: NDArray[np.float32]
+    sizes: NDArray[np.int64]
     cameras: Cameras | None = None
     train_cameras: Cameras | None = None
 
     @property
-    def shape(self) -> tuple[int, int]:
-        """Height and width."""
-        return self.photos.shape[1], self.photos.shape[2]
+    def shapes(self) -> list[tuple[int, int]]:
+        """Height and width of each."""
+        return [(height, width) for width, height in self.sizes.tolist()]
 
 
 def read_ground_truth(
@@ -82,7 +83,7 @@ def read_ground_truth(
     if eval_split is not None or (folder / "transforms.json").is_file() or find_model(folder) is not None:
         found = _read_capture(folder, views, downscale, eval_split, train_split, normalize)
     else:
-        found = _Photos(*read_photos(folder, views, downscale=downscale))
+        found = _Photos(*read_sized_photos(folder, views, downscale=downscale))
     name = folder.resolve().name
     if stored is not None and masks is not None:
         return _with_stored_masks(name, found, stored, masks, downscale, occlusion, min_views)
@@ -90,9 +91,9 @@ def read_ground_truth(
         if given:
             held = "no masks" if masks is None else f"the pictures in {masks}"
             raise InvalidFile(f"evaluate: {option} needs masks.npz (of unghost masks) as masks, got {held}")
-    visible = None if masks is None else read_masks(masks, found.names, found.shape)
+    visible = None if masks is None else read_masks(masks, found.names, found.shapes)
     extent, notes = _extent(found)
-    truth = Truth(found.photos, visible, cameras=found.cameras, names=found.names)
+    truth = Truth(found.photos, visible, cameras=found.cameras, names=found.names, sizes=found.sizes)
     return GroundTruth(name, truth, extent, {"masks": None if masks is None else masks.name}, notes)
 
 
@@ -105,11 +106,12 @@ def _with_stored_masks(
     occlusion: bool | None,
     min_views: int,
 ) -> GroundTruth:
-    height, width = found.shape
-    size = stored.eval_cameras.width, stored.eval_cameras.height
-    if (width, height) != size:
+    sizes = stored.eval_cameras.sizes
+    differ = (found.sizes != sizes).any(axis=1)
+    if differ.any():
+        (width, height), (wide, high) = found.sizes[differ][0].tolist(), sizes[differ][0].tolist()
         raise InvalidArgument(
-            f"evaluate: the photos are {width} x {height}, {masks} is of {size[0]} x {size[1]}; see downscale "
+            f"evaluate: the photos are {width} x {height}, {masks} is of {wide} x {high}; see downscale "
             f"(now {downscale:g})"
         )
     check_cameras(masks, stored, eval_cameras=found.cameras, train_cameras=found.train_cameras)
@@ -151,4 +153,9 @@ def _read_capture(
     if train_split is not None or any(name in capture.splits for name in TRAIN_NAMES):
         named = choose_split(capture.splits, train_split, TRAIN_NAMES, "evaluate: train_split")
         train_cameras = capture.cameras.select(capture.split(named))
-    return _Photos(names, capture.images(indices), capture.cameras.select(indices), train_cameras)
+    cameras = capture.cameras.select(indices)
+    if cameras.same_size:
+        photos = capture.images(indices)
+    else:
+        photos = pad_views([capture.images([index])[0] for index in indices], cameras.canvas, 0.0)
+    return _Photos(names, photos, cameras.sizes, cameras, train_cameras)

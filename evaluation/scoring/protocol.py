@@ -82,14 +82,15 @@ def view_counts(
     Args:
         eval_cameras: ``n`` cameras.
         pseudo_depth: ``(n, H, W)`` distance along the unit ray, scene units, > 0; not clipped here, as the
-            question is a geometric one; inf (no surface) is taken to be far away.
+            question is a geometric one; inf (no surface) is taken to be far away. Of views that differ in size,
+            each in the upper left corner and inf beside it (:attr:`~unghost.core.cameras.Cameras.canvas`).
         train_cameras: ``m`` cameras.
         train_depth: ``(m, h, w)`` distance along the unit rays of the *training* cameras, inf for nothing:
             makes the test occlusion-aware (a departure from the paper).
         tolerance: relative tolerance of that test.
 
     Returns:
-        ``(n, H, W)``, 0 to ``m``.
+        ``(n, H, W)``, 0 to ``m``; 0 beside a view.
     """
     depth = _depths("view_counts", pseudo_depth, eval_cameras, "pseudo_depth")
     optical = None
@@ -98,8 +99,9 @@ def view_counts(
     far = FAR * depth_limit(train_cameras, eval_cameras)
     counts = np.zeros(depth.shape, dtype=np.int64)
     for index in range(len(eval_cameras)):
-        points = backproject(np.minimum(depth[index], far), eval_cameras, index)
-        counts[index] = train_cameras.view_count(points, depth_maps=optical, tolerance=tolerance)
+        window = eval_cameras.window(index)
+        points = backproject(np.minimum(depth[index][window], far), eval_cameras, index)
+        counts[index][window] = train_cameras.view_count(points, depth_maps=optical, tolerance=tolerance)
     return counts
 
 
@@ -120,7 +122,7 @@ def common_mask(masks: Sequence[Mask]) -> Mask:
 
 
 def _depths(caller: str, depth: NDArray[Any], cameras: Cameras, name: str) -> NDArray[Any]:
-    shape = (len(cameras), cameras.height, cameras.width)
+    shape = (len(cameras), *cameras.canvas)
     array = np.asarray(depth, dtype=np.float64)
     if array.shape != shape:
         raise InvalidArgument(f"{caller}: {name} must have shape {shape}, got {array.shape}")

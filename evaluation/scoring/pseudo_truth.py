@@ -24,10 +24,11 @@ from ..metrics.checks import Mask
 from ..metrics.geometry import normals_from_depth
 from .conventions import SceneExtent
 from .protocol import view_counts
-from .views import Truth, check_depth, check_normals
+from .views import Truth, check_depth, check_normals, pad_views
 
 FORMAT = "unghost-pseudo-gt"
 FORMAT_VERSION = 1
+LENS_VERSION = 2  # of a file with fisheyes, or with cameras that differ in size: an older reader must not take it
 MAPS = {"depth": "<f4", "normals": "<f4", "seen_frustum": "<u2", "seen_open": "<u2"}
 LENSES = {"camera_to_world": (3, 4), "intrinsics": (4,), "distortion": (6,)}
 SAME_CAMERA = 1e-6  # relative: cameras that went through a text file are still the same
@@ -91,12 +92,15 @@ class PseudoTruth:
         for side, cameras in (("eval", self.eval_cameras), ("train", self.train_cameras)):
             arrays |= {f"{side}_{name}": getattr(cameras, name) for name in LENSES}
         arrays = {name: np.ascontiguousarray(values, dtype=_dtype(name)) for name, values in arrays.items()}
+        rigs = {"eval": self.eval_cameras, "train": self.train_cameras}
+        plain = all(cameras.same_size and not cameras.fisheye.any() for cameras in rigs.values())
+        fisheyes = {f"{side}_fisheye": cameras.fisheye.tolist() for side, cameras in rigs.items()}
         manifest = {
             "format": FORMAT,
-            "format_version": FORMAT_VERSION,
+            "format_version": FORMAT_VERSION if plain else LENS_VERSION,
             "names": list(self.names),
-            "eval_size": [self.eval_cameras.width, self.eval_cameras.height],
-            "train_size": [self.train_cameras.width, self.train_cameras.height],
+            **{f"{side}_size": _stored_size(cameras) for side, cameras in rigs.items()},
+            **({} if plain else fisheyes),
             "depth_limit": self.extent.limit,
             "tolerance": self.tolerance,
             "sha256": {name: _digest(values) for name, values in arrays.items()},
@@ -122,7 +126,8 @@ def make_pseudo_truth(
     Args:
         eval_cameras: ``n`` cameras; ``train_cameras``: ``m``. Together at least two distinct origins.
         train_cameras: see above.
-        depth: ``(n, H, W)`` along the unit ray, scene units, > 0, inf for no surface.
+        depth: ``(n, H, W)`` along the unit ray, scene units, > 0, inf for no surface. Of views that differ in size,
+            each in the upper left corner (:attr:`~unghost.core.cameras.Cameras.canvas`) and inf beside it.
         normals: ``(n, H, W, 3)`` unit, world axes, NaN for none; None: from the depth.
         train_depth: ``(m, h, w)`` of the training views, for occlusion-aware visibility.
         tolerance: relative depth tolerance of that.
@@ -140,7 +145,9 @@ def make_pseudo_truth(
     single = np.asarray(depth, dtype=np.float32)
     if normals is None:
         exact = np.asarray(depth, dtype=np.float64)
-        normals = np.stack([normals_from_depth(exact[i], eval_cameras, i) for i in range(len(eval_cameras))])
+        windows = [(index, eval_cameras.window(index)) for index in range(len(eval_cameras))]
+        views = [normals_from_depth(exact[index][window], eval_cameras, index) for index, window in windows]
+        normals = pad_views(views, eval_cameras.canvas, np.nan)
     labels = tuple(names) or tuple(str(index) for index in range(len(eval_cameras)))
     try:
         json.dumps(dict(details or {}), allow_nan=False)
@@ -168,8 +175,8 @@ def load_pseudo_truth(
 
     Args:
         path: of the file.
-        eval_cameras, train_cameras: if given, the file must be of these cameras: size, poses, intrinsics and
-            distortion equal to a millionth.
+        eval_cameras, train_cameras: if given, the file must be of these cameras: size, kind of lens, poses, intrinsics
+            and distortion equal to a millionth.
 
     Raises:
         FileNotFoundError: no such file.
@@ -234,9 +241,10 @@ def _read(source: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         raise InvalidFile(f"{caller}: {source} is not pseudo ground truth, or is truncated ({fault})") from None
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise InvalidFile(f"{caller}: {source} is not pseudo ground truth (format must be {FORMAT!r})")
-    if manifest.get("format_version") != FORMAT_VERSION:
+    if manifest.get("format_version") not in (FORMAT_VERSION, LENS_VERSION):
         raise InvalidFile(
-            f"{caller}: {source} has version {manifest.get('format_version')!r}, this release reads {FORMAT_VERSION}"
+            f"{caller}: {source} has version {manifest.get('format_version')!r}, this release reads {FORMAT_VERSION} "
+            f"and {LENS_VERSION}"
         )
     hashes = manifest.get("sha256")
     if not isinstance(hashes, dict) or set(hashes) != set(arrays):
@@ -249,12 +257,19 @@ def _read(source: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
 
 def _cameras(side: str, manifest: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Cameras:
     poses, intrinsics, distortion = (arrays[f"{side}_{name}"] for name in LENSES)
-    width, height = (int(each) for each in manifest[f"{side}_size"])
-    return Cameras.create(poses, intrinsics, width, height, distortion)
+    size = np.array(manifest[f"{side}_size"], dtype=np.int64)
+    fisheye = np.array(manifest.get(f"{side}_fisheye", False), dtype=bool)
+    return Cameras.create(poses, intrinsics, size[..., 0], size[..., 1], distortion, fisheye)
+
+
+def _stored_size(cameras: Cameras) -> list[Any]:
+    """Width and height, or those of each camera where they differ."""
+    sizes: list[Any] = [cameras.width, cameras.height] if cameras.same_size else cameras.sizes.tolist()
+    return sizes
 
 
 def _check(caller: str, maps: PseudoTruth) -> None:
-    shape = (len(maps.eval_cameras), maps.eval_cameras.height, maps.eval_cameras.width)
+    shape = (len(maps.eval_cameras), *maps.eval_cameras.canvas)
     wanted = {"depth": shape, "normals": (*shape, 3), "seen_frustum": shape, "seen_open": shape}
     for name, each in wanted.items():
         values = getattr(maps, name)
@@ -269,13 +284,21 @@ def _check(caller: str, maps: PseudoTruth) -> None:
 
 
 def _check_cameras(source: Path, side: str, stored: Cameras, wanted: Cameras) -> None:
-    here = (len(wanted), wanted.width, wanted.height)
-    there = (len(stored), stored.width, stored.height)
+    here, there = ((len(each), *each.canvas[::-1]) for each in (wanted, stored))
     if here != there:
         raise InvalidFile(
             f"load_pseudo_truth: {source} is of {there[0]} {side} cameras of {there[1]} x {there[2]}, not of {here[0]} "
             f"of {here[1]} x {here[2]}"
         )
+    for name, differ in (
+        ("size", (stored.sizes != wanted.sizes).any(axis=1)),
+        ("lens (fisheye or not)", stored.fisheye != wanted.fisheye),
+    ):
+        if differ.any():
+            raise InvalidFile(
+                f"load_pseudo_truth: {source} is of other {side} cameras: camera {int(differ.argmax())} has another "
+                f"{name}"
+            )
     for name in LENSES:
         first, second = getattr(stored, name), getattr(wanted, name)
         size = max(float(np.abs(second).max(initial=0.0)), 1.0)

@@ -26,7 +26,9 @@ from numpy.typing import NDArray
 
 from ...core.errors import InvalidArgument, InvalidFile, MissingExtra, MissingFile
 from ..metrics.checks import Mask
-from .views import Renders
+from .views import Renders, pad_views
+
+Shape = tuple[int, int]  # height and width
 
 PICTURES = (".png", ".jpg", ".jpeg")
 EIGHT_BITS = ("RGB", "L", "P", "RGBA", "LA", "PA", "1")
@@ -34,6 +36,7 @@ KNOBS = ("confidence", "uncertainty")
 MAPS = ("depth", "accumulation", "normals", *KNOBS)
 ARCHIVE = "maps.npz"
 COLORS, RAW, PACKED = "rgb", "raw-", ".npy.gz"  # nerfstudio's
+BESIDE = {"depth": np.inf, "accumulation": 0.0}  # a view that is smaller than the others; NaN for the other maps
 NAMED = 3  # of those that do not match, in a message
 
 
@@ -53,14 +56,15 @@ class Method:
     confidence: NDArray[Any] | None = None
 
 
-def read_method(name: str, folder: str | Path, views: Sequence[str], shape: tuple[int, int]) -> Method:
+def read_method(name: str, folder: str | Path, views: Sequence[str], shape: Shape | Sequence[Shape]) -> Method:
     """Read a folder of renders (see the module).
 
     Args:
         name: of the method.
         folder: its renders.
         views: what the views are called; an ending (``images/a.jpg``) is left aside.
-        shape: ``(height, width)`` that all must have.
+        shape: ``(height, width)`` that all must have, or one a view. Views that differ in size are padded at the right
+            and below (:func:`~unghost.evaluation.scoring.views.pad_views`).
 
     Raises:
         FileNotFoundError: no such folder.
@@ -101,7 +105,26 @@ def read_photos(
 
     Raises:
         FileNotFoundError: no such folder.
-        ValueError: no photo, photos of ``views`` that are missing, of two sizes, transparent or undecodable.
+        ValueError: no photo, photos of ``views`` that are missing, of two sizes (:func:`read_sized_photos` takes them),
+            transparent or undecodable.
+    """
+    names, photos, sizes = read_sized_photos(folder, views, downscale=downscale)
+    if (sizes != sizes[:1]).any():
+        listed = _listed({_times(size) for size in map(tuple, sizes.tolist())})
+        raise InvalidFile(f"read_photos: the photos of {folder} must have one size, got {listed}")
+    return names, photos
+
+
+def read_sized_photos(
+    folder: str | Path, views: Sequence[str] | None = None, *, downscale: float = 1.0
+) -> tuple[tuple[str, ...], NDArray[np.float32], NDArray[np.int64]]:
+    """:func:`read_photos` that may differ in size: padded at the right and below, with each one's width and height.
+
+    Returns:
+        names ``(n,)``, photos ``(n, H, W, 3)``, sizes ``(n, 2)``.
+
+    Raises:
+        FileNotFoundError, ValueError: as :func:`read_photos`, but for sizes.
     """
     if not downscale >= 1:
         raise InvalidArgument(f"read_photos: downscale must be >= 1, got {downscale}")
@@ -110,15 +133,13 @@ def read_photos(
     names = tuple(found) if views is None else tuple(views)
     keys = names if views is None else match_names("photos", list(found), names, where=str(source), whole=False)
     paths = [found[key] for key in keys]
-    sizes = {_size(path) for path in paths}
-    if len(sizes) > 1:
-        raise InvalidFile(f"read_photos: the photos of {source} must have one size, got {_listed(map(_times, sizes))}")
-    width, height = sizes.pop()
-    shape = max(1, round(height / downscale)), max(1, round(width / downscale))
-    return names, _stack(paths, shape, resize=True)
+    stored = [_size(path) for path in paths]
+    shapes = [(max(1, round(height / downscale)), max(1, round(width / downscale))) for width, height in stored]
+    sizes = np.array([shape[::-1] for shape in shapes], dtype=np.int64)
+    return names, _stack(paths, shapes, resize=True), sizes
 
 
-def read_masks(folder: str | Path, views: Sequence[str], shape: tuple[int, int]) -> Mask:
+def read_masks(folder: str | Path, views: Sequence[str], shape: Shape | Sequence[Shape]) -> Mask:
     """White-on-black mask pictures, a view each: ``(n, H, W)`` bool, from half of white on a pixel counts.
 
     ``images_a.png.mask.png``, as ``unghost masks`` names them, belongs to view ``images/a.png``, or, of a folder of
@@ -141,7 +162,7 @@ def read_masks(folder: str | Path, views: Sequence[str], shape: tuple[int, int])
     return np.asarray(_stack([found[key] for key in keys], shape).mean(axis=-1) >= 0.5, dtype=np.bool_)
 
 
-def read_map(folder: str | Path, key: str, views: Sequence[str], shape: tuple[int, int]) -> Any:
+def read_map(folder: str | Path, key: str, views: Sequence[str], shape: Shape | Sequence[Shape]) -> Any:
     """One kind of map of the views, without their pictures: ``(n, H, W)`` (normals: ``(n, H, W, 3)``), or None.
 
     Args:
@@ -153,13 +174,20 @@ def read_map(folder: str | Path, key: str, views: Sequence[str], shape: tuple[in
         ValueError: maps of views that are missing, of another shape, or not floating point.
     """
     below, archive = Path(folder) / key, Path(folder) / ARCHIVE
-    wanted = (*shape, 3) if key == "normals" else shape
+    shapes = _shapes(shape, len(views))
+    canvas, deep = _canvas(shapes), (3,) if key == "normals" else ()
     if archive.is_file():
         names, values = _archive(archive, key)
         if values is not None:
             chosen = match_names(f"{key} maps", names, views, where=str(archive), whole=False)
             position = {name: index for index, name in enumerate(names)}
-            return _checked(f"{key} in {archive}", values[[position[name] for name in chosen]], wanted)
+            chosen_maps = values[[position[name] for name in chosen]]
+            stacked = _checked(f"{key} in {archive}", chosen_maps, (*canvas, *deep))
+            if all(each == canvas for each in shapes):
+                return stacked
+            return pad_views(
+                [each[: s[0], : s[1]] for each, s in zip(stacked, shapes)], canvas, BESIDE.get(key, np.nan)
+            )
     below = below if below.is_dir() else below.with_name(RAW + key)
     if not below.is_dir():
         return None
@@ -168,7 +196,10 @@ def read_map(folder: str | Path, key: str, views: Sequence[str], shape: tuple[in
     if not found:
         return None  # pictures for people
     chosen = match_names(f"{key} maps", list(found), views, where=str(below), whole=False)
-    return np.stack([_checked(str(found[name]), _load(found[name])[None], wanted)[0] for name in chosen])
+    maps = [
+        _checked(str(found[name]), _load(found[name])[None], (*each, *deep))[0] for name, each in zip(chosen, shapes)
+    ]
+    return pad_views(maps, canvas, BESIDE.get(key, np.nan))
 
 
 def match_names(
@@ -264,6 +295,15 @@ def _checked(where: str, values: NDArray[Any], shape: tuple[int, ...]) -> NDArra
     return values
 
 
+def _shapes(shape: Shape | Sequence[Shape], count: int) -> list[Shape]:
+    """Height and width of each view."""
+    return [(int(height), int(width)) for height, width in np.broadcast_to(np.array(shape), (count, 2))]
+
+
+def _canvas(shapes: Sequence[Shape]) -> Shape:
+    return max(each[0] for each in shapes), max(each[1] for each in shapes)
+
+
 def _times(size: tuple[int, int]) -> str:
     return f"{size[0]} x {size[1]}"
 
@@ -277,18 +317,20 @@ def _size(path: Path) -> tuple[int, int]:
         raise InvalidFile(f"cannot read {path} ({error})") from None
 
 
-def _stack(paths: Sequence[Path], shape: tuple[int, int], *, resize: bool = False) -> NDArray[np.float32]:
+def _stack(paths: Sequence[Path], shape: Shape | Sequence[Shape], *, resize: bool = False) -> NDArray[np.float32]:
     """``(n, H, W, 3)`` float32 in [0, 1]; pictures of another size are refused together unless resized."""
-    wanted = shape[1], shape[0]
-    other = [(path, _size(path)) for path in paths if not resize and _size(path) != wanted]
+    shapes = _shapes(shape, len(paths))
+    sizes = [(width, height) for height, width in shapes]
+    other = [(path, _size(path), size) for path, size in zip(paths, sizes) if not resize and _size(path) != size]
     if other:
+        wanted = other[0][2]
         factor = wanted[0] / other[0][1][0]
         hint = f"; the photos are {factor:.4g} times as wide (see downscale)" if factor > 1 else ""
         raise InvalidFile(
             f"{len(other)} of {len(paths)} pictures in {other[0][0].parent} are not {_times(wanted)} as the photos "
-            f"are: {_listed(f'{path.name} is {_times(size)}' for path, size in other)}{hint}"
+            f"are: {_listed(f'{path.name} is {_times(size)}' for path, size, _ in other)}{hint}"
         )
-    return np.stack([_read(path, wanted) for path in paths])
+    return pad_views([_read(path, size) for path, size in zip(paths, sizes)], _canvas(shapes), 0.0)
 
 
 def _read(path: Path, size: tuple[int, int]) -> NDArray[np.float32]:

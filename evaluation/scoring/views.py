@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -91,6 +92,9 @@ class Truth:
         normals: ``(n, H, W, 3)`` as in :class:`Renders`; None: taken from the depth.
         cameras: the ``n`` cameras, to take normals from depth; None if normals are given or not asked for.
         names: of the views, for rows and pages; ``0``, ``1``, … unless given.
+        sizes: ``(n, 2)`` width and height of each view, where they differ; None: those of the cameras, or all the
+            same. Every array, also of the renders, then holds each view in its upper left corner, and what lies beside
+            it (:func:`pad_views`) counts nowhere.
     """
 
     photos: NDArray[Any]
@@ -99,6 +103,7 @@ class Truth:
     normals: NDArray[Any] | None = None
     cameras: Cameras | None = None
     names: tuple[str, ...] = ()
+    sizes: NDArray[np.int64] | None = None
 
     def __post_init__(self) -> None:
         _colours("Truth", "photos", self.photos)
@@ -111,7 +116,7 @@ class Truth:
         check_depth("Truth", "depth", self.depth)
         check_normals("Truth", "normals", self.normals)
         if self.cameras is not None:
-            found = (len(self.cameras), self.cameras.height, self.cameras.width)
+            found = (len(self.cameras), *self.cameras.canvas)
             if found != shape:
                 raise InvalidArgument(f"Truth: cameras must be {shape} (n, H, W), got {found}")
         names = tuple(self.names) or tuple(str(index) for index in range(shape[0]))
@@ -120,9 +125,60 @@ class Truth:
                 f"Truth: names must be {shape[0]} different ones, got {len(names)} ({len(set(names))})"
             )
         object.__setattr__(self, "names", names)
+        object.__setattr__(self, "sizes", self._sizes())
+
+    def _sizes(self) -> NDArray[np.int64]:
+        count, height, width = self.photos.shape[:3]
+        known = None if self.cameras is None else self.cameras.sizes
+        sizes = self.sizes if self.sizes is not None else known
+        if sizes is None:
+            sizes = np.tile([width, height], (count, 1))
+        sizes = np.asarray(sizes, dtype=np.int64)
+        if sizes.shape != (count, 2) or (sizes < 1).any() or tuple(sizes.max(axis=0)) != (width, height):
+            raise InvalidArgument(
+                f"Truth: sizes must be {count} of width and height, the largest {width} x {height}, "
+                f"got {sizes.tolist()}"
+            )
+        if known is not None and (known != sizes).any():
+            raise InvalidArgument("Truth: sizes must be those of the cameras")
+        return sizes
 
     def __len__(self) -> int:
         return len(self.photos)
+
+    def window(self, index: int) -> tuple[slice, slice]:
+        """Rows and columns of one view."""
+        assert self.sizes is not None
+        width, height = self.sizes[index].tolist()
+        return slice(0, height), slice(0, width)
+
+    @property
+    def shapes(self) -> list[tuple[int, int]]:
+        """Height and width of each view."""
+        assert self.sizes is not None
+        return [(height, width) for width, height in self.sizes.tolist()]
+
+    def inside(self) -> Mask | None:
+        """``(n, H, W)`` bool: pixels that belong to a view; None where all do."""
+        assert self.sizes is not None
+        height, width = self.photos.shape[1:3]
+        if (self.sizes == [width, height]).all():
+            return None
+        column, row = np.arange(width) < self.sizes[:, :1], np.arange(height) < self.sizes[:, 1:]
+        return np.asarray(row[:, :, None] & column[:, None, :], dtype=np.bool_)
+
+
+def pad_views(views: Sequence[NDArray[Any]], canvas: tuple[int, int], fill: Any) -> NDArray[Any]:
+    """Arrays ``(h, w, ...)`` of views as one ``(n, H, W, ...)``, each in the upper left corner of ``canvas (H, W)``.
+
+    Equal views that fill the canvas are stacked.
+    """
+    if all(view.shape[:2] == canvas for view in views):
+        return np.stack(views)
+    padded = np.full((len(views), *canvas, *views[0].shape[2:]), fill, dtype=views[0].dtype)
+    for place, view in zip(padded, views):
+        place[: view.shape[0], : view.shape[1]] = view
+    return padded
 
 
 def check_match(caller: str, renders: Renders, truth: Truth) -> None:

@@ -41,7 +41,8 @@ def photo_doubt(
         photos: ``(m, h, w, 3)`` that the field was trained on, in [0, 1].
         photo_depth: ``(m, h, w)`` as the *field* renders it from the photos' cameras, like ``depth``: what lies behind
             it is not seen by that photo.
-        photo_cameras: of the photos.
+        photo_cameras: of the photos. Arrays of views that differ in size hold each in the upper left corner
+            (:attr:`~unghost.core.cameras.Cameras.canvas`); beside it, depth is inf.
         tolerance: how far behind that depth a point may lie and still be seen, and how far from it on either side
             and still be the same surface, as a share of it; >= 0.
         slack: the same in scene units, on top; two cells of a grid, say.
@@ -73,20 +74,23 @@ def photo_doubt(
             raise InvalidArgument(f"photo_doubt: {name} must be finite and >= 0, got {value}")
     result = np.full(depth.shape, UNSEEN, dtype=np.float32)
     for index in range(len(cameras)):
-        known = np.isfinite(depth[index])
+        window = cameras.window(index)
+        here, shown = depth[index][window], colors[index][window]
+        known = np.isfinite(here)
         origins, directions = cameras.rays(index)
-        points = origins[known] + directions[known] * depth[index][known][:, None].astype(np.float64)
-        shown, doubt = colors[index][known].astype(np.float64), np.full(len(points), UNSEEN)
+        points = origins[known] + directions[known] * here[known][:, None].astype(np.float64)
+        shown, doubt = shown[known].astype(np.float64), np.full(len(points), UNSEEN)
         for start in range(0, len(points), CHUNK):
             part = slice(start, start + CHUNK)
             total, seen, same = (np.zeros(len(points[part])) for _ in range(3))
             for other in range(len(photo_cameras)):
                 chosen, pixels, on = _seen_by(photo_cameras, other, points[part], photo_depth[other], tolerance, slack)
-                total[chosen] += np.abs(sample_bilinear(photos[other], pixels) - shown[part][chosen]).mean(axis=-1)
+                photo = photos[other][photo_cameras.window(other)]
+                total[chosen] += np.abs(sample_bilinear(photo, pixels) - shown[part][chosen]).mean(axis=-1)
                 seen[chosen] += 1
                 same[chosen] += on
             doubt[part] = np.where(seen > 0, total / np.maximum(seen, 1) / np.sqrt(1 + same), UNSEEN)
-        result[index][known] = doubt
+        result[index][window][known] = doubt
     return result
 
 
@@ -98,7 +102,8 @@ def _seen_by(
     chosen = np.flatnonzero(inside)
     pixels = pixels[chosen]
     column, row = (np.floor(pixels[:, axis]).astype(np.int64) for axis in (0, 1))
-    limit = depth[np.minimum(row, cameras.height - 1), np.minimum(column, cameras.width - 1)]
+    width, height = cameras.size(index)
+    limit = depth[np.minimum(row, height - 1), np.minimum(column, width - 1)]
     away = points[chosen] - cameras.origins[index]
     squared = np.einsum("ni,ni->n", away, away)
     near = squared <= (limit * (1.0 + tolerance) + slack) ** 2
@@ -125,7 +130,7 @@ def sample_bilinear(image: NDArray[Any], pixels: NDArray[Any]) -> FloatArray:
 
 
 def _check(lens: str, cameras: Cameras, **maps: NDArray[Any]) -> None:
-    size = (len(cameras), cameras.height, cameras.width)
+    size = (len(cameras), *cameras.canvas)
     for name, values in maps.items():
         is_depth = name.endswith("depth")
         wanted = size if is_depth else (*size, 3)

@@ -230,3 +230,20 @@ def test_distorted_cameras_do_for_both(kit, aabb, crowd):
     regularizer, denoiser = build(kit, aabb, CHANNEL_NAMES, bent)
     regularizer(waves_of_tensors)
     assert len(np.unique(denoiser.calls[0][0][:, 2])) > 2
+
+
+def test_fisheyes_and_cameras_that_differ_in_size_do_for_both(kit, aabb, crowd):
+    """Every other one a fisheye in portrait; what a denoiser is told is the sum over rigs of one size."""
+    round_ = np.arange(9) % 2 == 1
+    bend = np.where(round_[:, None], [0.05, -0.01, 0, 0, 0, 0], 0.0)
+    mixed = Cameras.create(
+        crowd.camera_to_world, crowd.intrinsics, np.where(round_, 30, 40), np.where(round_, 40, 30), bend, round_
+    )
+    regularizer, denoiser = build(kit, aabb, CHANNEL_NAMES, mixed)
+    regularizer(waves_of_tensors)
+    assert len(np.unique(denoiser.calls[0][0][:, 2])) > 2
+    centers, edges = np.array([[0.1, 0.2, 0.0], [0.5, -0.3, 0.2]]), np.array([0.8, 0.4])
+    turned = np.broadcast_to(np.eye(3), (2, 3, 3))
+    parts = [count_views(mixed.select(group), centers, edges, turned).astype(int) for group in mixed.by_size()]
+    np.testing.assert_array_equal(count_views(mixed, centers, edges, turned), sum(parts))
+    assert all(part.any() for part in parts)

@@ -139,6 +139,9 @@ def test_render_view_sees_the_slab_at_its_depth_in_any_chunking():
     again = render_view(field, cameras, 0, sampling=SAMPLING, chunk=7)
     for name in view:
         np.testing.assert_allclose(again[name], view[name], atol=1e-5)
+    beside = Cameras.create(np.repeat(pose, 2, axis=0), cameras.intrinsics[0], [5, 8], [9, 6])
+    for name, values in render_view(field, beside, 1, sampling=SAMPLING).items():
+        np.testing.assert_array_equal(values, view[name])
     away = Cameras.create(
         pose * np.array([1.0, 1.0, -1.0, 1.0]) * np.array([-1.0, 1.0, 1.0, 1.0]), cameras.intrinsics, 8, 6
     )

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import torch
 
+from unghost.core.cameras import Cameras
 from unghost.fields.radiance import RadianceConfig, RadianceField
 from unghost.fields.rendering import Rendering, Sampling
 from unghost.fields.training import TrainingConfig, distortion_loss, gather_rays, train_field
@@ -48,6 +49,20 @@ def test_gather_rays_lines_up_pixels_and_colours(photos):
     np.testing.assert_allclose(origins[row], start, atol=1e-6)
     np.testing.assert_allclose(directions[row], toward, atol=1e-6)
     np.testing.assert_allclose(colors[row], images[3, 5, 7])
+
+
+def test_gather_rays_of_photos_that_differ_in_size():
+    """Portrait and landscape: what stands beside a photo gives no ray."""
+    pose = np.repeat(np.eye(4)[None], 2, axis=0)
+    cameras = Cameras.create(pose, np.array([4.0, 4.0, 2.0, 2.0]), [6, 4], [4, 6], fisheye=[False, True])
+    images = np.full((2, 6, 6, 3), np.nan)
+    for index in range(2):
+        images[index][cameras.window(index)] = index
+    origins, directions, colors = gather_rays(cameras, images)
+    assert len(origins) == len(directions) == len(colors) == 48
+    assert colors[:24].eq(0).all()
+    assert colors[24:].eq(1).all()
+    np.testing.assert_allclose(directions[24:].reshape(6, 4, 3), cameras.rays(1)[1], atol=1e-6)
 
 
 def test_wrong_images_are_refused(photos):

@@ -68,6 +68,46 @@ def test_cells_settle_nothing_wrongly(lens, min_views):
     assert ViewCounter(rig, aabb=BOX)(np.zeros((0, 3))).shape == (0,)
 
 
+FISHEYES = {
+    "narrow": (400.0, np.array([0.05, -0.01, 0.002, 0, 0, 0])),
+    "wide": (140.0, np.array([0.05, -0.01, 0.002, 0, 0, 0])),
+    "circle": (140.0, np.array([-0.2, 0, 0, 0, 0, 0])),  # nothing beyond 74 degrees
+    "beyond the plane": (80.0, np.zeros(6)),
+}
+
+
+@pytest.mark.parametrize("lens", FISHEYES)
+@pytest.mark.parametrize("min_views", [1, 4])
+def test_cells_of_fisheyes_and_of_other_sizes_settle_nothing_wrongly(lens, min_views):
+    focal, bend = FISHEYES[lens]
+    plain, round_ = cameras(), np.arange(24) % 2 == 0
+    intrinsics = np.where(round_[:, None], [focal, focal, 200.0, 150.0], [300.0, 310.0, 100.0, 150.0])
+    width = np.where(round_, 400, 200)
+    rig = Cameras.create(plain.camera_to_world, intrinsics, width, 300, np.where(round_[:, None], bend, 0), round_)
+    rng = np.random.default_rng(1)
+    points = np.concatenate([rng.uniform(BOX[0], BOX[1], (4000, 3)), rng.uniform(-3, 3, (1000, 3)), rig.origins, BOX])
+    full = np.minimum(rig.view_count(points), min_views)
+    for counter in (ViewCounter(rig, min_views=min_views), ViewCounter(rig, min_views=min_views, aabb=BOX)):
+        np.testing.assert_array_equal(np.minimum(counter(points), min_views), full)
+    cells = ViewGrid(rig, BOX, min_views=min_views).cells
+    assert (cells == OPEN).mean() < 0.9  # not all is left to the exact test
+
+
+def test_occlusion_of_cameras_that_differ_in_size():
+    plain = cameras(4)
+    width = np.array([400, 200, 400, 200])
+    rig = Cameras.create(plain.camera_to_world, plain.intrinsics, width, 300)
+    rng = np.random.default_rng(3)
+    depth = [rng.uniform(0.2, 2.0, (300, each)) for each in width]
+    points = rng.uniform(BOX[0], BOX[1], (2000, 3))
+    full = rig.view_count(points, depth_maps=depth)
+    np.testing.assert_array_equal(ViewCounter(rig, min_views=9, depth_maps=depth)(points), full)
+    with pytest.raises(ValueError, match="for each of the 4 cameras, got 3; the first that differs is number 3"):
+        ViewCounter(rig, depth_maps=depth[:3])
+    with pytest.raises(ValueError, match="got 4; the first that differs is number 1"):
+        ViewCounter(rig, depth_maps=[depth[0]] * 4)
+
+
 @pytest.mark.parametrize("levels", [1, 2, 4])
 def test_cells_of_any_size_give_the_same_counts(levels):
     rig, points = cameras(), np.random.default_rng(8).uniform(BOX[0], BOX[1], (3000, 3))

@@ -47,7 +47,8 @@ def masks(
     Args:
         capture: folder with transforms.json, its photos, and the sweeps (splits.json or nerfstudio's lists).
         depth: .npy, or .npz with "depth": (n, H, W) of the evaluation views, in the capture's (normalised) units; inf
-            for no surface. From a field trained on all photos, or exact.
+            for no surface. From a field trained on all photos, or exact. Views that differ in size: each in the upper
+            left corner of (H, W), inf beside it.
         out: folder for a white-on-black PNG a view, and masks.npz with all counts.
         eval_split: the sweep that is scored.
         train_split: the sweep that was trained on.
@@ -84,9 +85,10 @@ def masks(
     visible = truth.visible(occlusion=beside is not None, minimum_views=min_views)
     out.mkdir(parents=True, exist_ok=True)
     truth.save(out / "masks.npz")
-    for name, mask in zip(names, visible):
+    seen = [mask[cameras.window(index)] for index, mask in enumerate(visible)]
+    for name, mask in zip(names, seen):
         Image.fromarray(np.where(mask, 255, 0).astype(np.uint8)).save(out / f"{name.replace('/', '_')}.mask.png")
-    coverage = visible.mean(axis=(1, 2))
+    coverage = np.array([mask.mean() for mask in seen])
     print(
         f"{len(views)} views, coverage {coverage.mean():.3f} (worst {coverage.min():.3f}, {names[coverage.argmin()]})"
     )

@@ -50,6 +50,7 @@ def doubt(
     from ..evaluation.captures.splits import EVAL_NAMES, TRAIN_NAMES, choose_split
     from ..evaluation.scoring.depths import ray_depth
     from ..evaluation.scoring.renders import read_map, read_method
+    from ..evaluation.scoring.views import pad_views
     from ..evaluation.uncertainty.photometric import UNSEEN, photo_doubt
 
     capture = load_capture(gt, downscale=downscale, normalize=normalize)
@@ -57,30 +58,31 @@ def doubt(
     taught = capture.split(choose_split(capture.splits, train_split, TRAIN_NAMES, "doubt: --train-split"))
     names, photo_names = ([capture.names[index] for index in part] for part in (views, taught))
     cameras, photo_cameras = capture.cameras.select(views), capture.cameras.select(taught)
-    shape = cameras.height, cameras.width
     _check_free(renders, replace)
-    method = read_method(renders.resolve().name, renders, names, shape)
+    method = read_method(renders.resolve().name, renders, names, cameras.shapes)
     depth = _there(method.renders.depth, renders)
-    photo_depth = _there(read_map(train_renders, "depth", photo_names, shape), train_renders)
+    photo_depth = _there(read_map(train_renders, "depth", photo_names, photo_cameras.shapes), train_renders)
     if depth_along == "axis":
         depth, photo_depth = ray_depth(depth, cameras), ray_depth(photo_depth, photo_cameras)
-    found = photo_doubt(
+    padded = photo_doubt(
         method.renders.colours,
         depth,
         cameras,
-        photos=capture.images(taught),
+        photos=pad_views([capture.images([index])[0] for index in taught], photo_cameras.canvas, 0.0),
         photo_depth=photo_depth,
         photo_cameras=photo_cameras,
         tolerance=tolerance,
         slack=slack,
     )
+    found = [values[cameras.window(index)] for index, values in enumerate(padded)]
     short = [Path(name).name for name in names]
     for name, values in zip(short if len(set(short)) == len(short) else names, found):
         _write((renders / KIND / name).with_suffix(".npy"), values)
-    seen = found[found < UNSEEN]
+    every = np.concatenate([values.ravel() for values in found])
+    seen = every[every < UNSEEN]
     median = f"; a doubt of {np.median(seen):.3f} in the median where one does" if seen.size else ""
     print(
-        f"{len(names)} views, {len(photo_names)} photos: {seen.size / found.size:.3f} of the pixels show what one of "
+        f"{len(names)} views, {len(photo_names)} photos: {seen.size / every.size:.3f} of the pixels show what one of "
         f"them sees{median}\n{renders / KIND}"
     )
 

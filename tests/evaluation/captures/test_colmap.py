@@ -19,6 +19,9 @@ PARAMETERS = {
     "SIMPLE_RADIAL": [60.0, 31.0, 25.0, 0.05],
     "RADIAL": [60.0, 31.0, 25.0, 0.05, -0.01],
     "OPENCV": [60.0, 61.0, 31.0, 25.0, 0.05, -0.01, 0.002, -0.003],
+    "SIMPLE_RADIAL_FISHEYE": [30.0, 31.0, 25.0, 0.05],
+    "RADIAL_FISHEYE": [30.0, 31.0, 25.0, 0.05, -0.01],
+    "OPENCV_FISHEYE": [30.0, 31.0, 31.0, 25.0, 0.05, -0.01, 0.002, -0.003],
     "FULL_OPENCV": [60.0, 61.0, 31.0, 25.0, 0.05, -0.01, 0.002, -0.003, 0.0, 0.1, 0.0, 0.0],
 }
 
@@ -53,14 +56,17 @@ def _write(folder, model, *, text=False, part="0"):
     return folder
 
 
-KINDS = [(f"{number}.png", kind) for number, kind in enumerate(PARAMETERS) if kind != "FULL_OPENCV"]
+KINDS = [(f"{number}.png", kind) for number, kind in enumerate(list(PARAMETERS)[:5])]
+FISHEYES = [(f"{number}.png", kind) for number, kind in enumerate(PARAMETERS) if kind.endswith("FISHEYE")]
 
 
 @pytest.mark.parametrize("text", [False, True])
-def test_a_point_projects_where_colmap_projects_it(tmp_path, text):
-    model = model_of(KINDS)
+@pytest.mark.parametrize("kinds", [KINDS, FISHEYES, [("0.png", "PINHOLE"), ("1.png", "OPENCV_FISHEYE")]])
+def test_a_point_projects_where_colmap_projects_it(tmp_path, kinds, text):
+    model = model_of(kinds)
     capture = load_capture(_write(tmp_path / "c", model, text=text), downscale=1, normalize=False)
-    assert capture.names == tuple(f"images/{name}" for name, _ in KINDS)
+    assert capture.names == tuple(f"images/{name}" for name, _ in kinds)
+    assert capture.cameras.fisheye.tolist() == [kind.endswith("FISHEYE") for _, kind in kinds]
     points = np.random.default_rng(0).uniform(-0.7, 0.7, (40, 3))
     for index, photo in enumerate(model.images[number] for number in sorted(model.images)):
         expected = np.array([photo.project_point(point) for point in points])
@@ -135,11 +141,69 @@ def test_of_parts_that_were_not_joined_the_largest_is_read_with_a_warning(tmp_pa
     assert find_model(tmp_path) is None
 
 
-def test_a_lens_that_opencv_cannot_say_is_refused(tmp_path):
-    folder = _write(tmp_path / "c", model_of([("a.png", "FULL_OPENCV")]))
-    with pytest.raises(
-        ValueError, match=r"camera 1 of .* is a FULL_OPENCV, none of SIMPLE_PINHOLE, .*image_undistorter"
-    ):
+def _of_one(tmp_path, kind, params):
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(camera_id=1, model=kind, width=WIDTH, height=HEIGHT, params=np.array(params))
+    model.add_camera_with_trivial_rig(camera)
+    model.add_image_with_trivial_frame(pycolmap.Image(name="a.png", camera_id=1, image_id=1), _pose(1))
+    return camera, _write(tmp_path / kind, model)
+
+
+@pytest.mark.parametrize(
+    ("kind", "params", "words"),
+    [
+        ("FULL_OPENCV", PARAMETERS["FULL_OPENCV"], "FULL_OPENCV with k4, k5, k6 other than 0"),
+        ("FOV", [60.0, 61.0, 31.0, 25.0, 0.9], "FOV, none of SIMPLE_PINHOLE, .*OPENCV_FISHEYE"),
+        ("THIN_PRISM_FISHEYE", [30.0, 30.0, 31.0, 25.0, *[0.01] * 8], "THIN_PRISM_FISHEYE, none of SIMPLE_PINHOLE"),
+    ],
+)
+def test_a_lens_that_is_not_read_is_refused(tmp_path, kind, params, words):
+    with pytest.raises(ValueError, match=rf"camera 1 of .* is a {words}.*image_undistorter"):
+        load_capture(_of_one(tmp_path, kind, params)[1])
+
+
+def test_full_opencv_that_does_not_divide_is_opencv(tmp_path):
+    _, folder = _of_one(tmp_path, "FULL_OPENCV", [60.0, 61.0, 31.0, 25.0, 0.05, -0.01, 0.002, -0.003, 0.02, 0, 0, 0])
+    cameras = load_cameras(folder)
+    assert cameras.distortion.tolist() == [[0.05, -0.01, 0.02, 0, 0.002, -0.003]]
+    theirs = pycolmap.Reconstruction(folder / "sparse" / "0").images[1]
+    points = np.random.default_rng(0).uniform(-0.7, 0.7, (20, 3))
+    expected = [theirs.project_point(point) for point in points]
+    np.testing.assert_allclose(cameras.project(0, points)[0], expected, atol=1e-9)
+
+
+def test_a_lens_that_no_photo_has_is_nobody_s_concern(tmp_path):
+    model = model_of(KINDS)
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(camera_id=9, model="FOV", width=WIDTH, height=HEIGHT, params=np.array([60.0, 61, 31, 25, 0.9]))
+    )
+    assert len(load_cameras(_write(tmp_path / "c", model))) == 5
+
+
+def test_portrait_and_landscape_in_one_model(tmp_path):
+    model = pycolmap.Reconstruction()
+    sizes = {1: (64, 48), 2: (48, 64)}
+    for number, (width, height) in sizes.items():
+        params = np.array([60.0, width / 2, height / 2])
+        camera = pycolmap.Camera(camera_id=number, model="SIMPLE_PINHOLE", width=width, height=height, params=params)
+        model.add_camera_with_trivial_rig(camera)
+    for number in range(1, 5):
+        image = pycolmap.Image(name=f"{number}.png", camera_id=1 + number % 2, image_id=number)
+        model.add_image_with_trivial_frame(image, _pose(number))
+    folder = _write(tmp_path / "c", model)
+    for number in range(1, 5):
+        Image.new("RGB", sizes[1 + number % 2], (number * 10, 0, 0)).save(folder / "images" / f"{number}.png")
+    capture = load_capture(folder, downscale=2, normalize=False)
+    assert capture.cameras.sizes.tolist() == [[24, 32], [32, 24]] * 2
+    assert capture.cameras.intrinsics[:2].tolist() == [[30, 30, 12, 16], [30, 30, 16, 12]]
+    assert capture.images([0, 2]).shape == (2, 32, 24, 3)
+    assert capture.images([3]).shape == (1, 24, 32, 3)
+    assert capture.images([1])[0, 0, 0, 0] == pytest.approx(20 / 255)
+    with pytest.raises(ValueError, match=r"differ in size \(24 x 32, 32 x 24\); ask for one size at a time.*by_size"):
+        capture.images()
+    assert load_cameras(folder).sizes.tolist() == [[48, 64], [64, 48]] * 2
+    Image.new("RGB", (64, 48)).save(folder / "images" / "1.png")
+    with pytest.raises(ValueError, match=r"photo images/1\.png is 64 x 48, the COLMAP model 0 says 48 x 64"):
         load_capture(folder)
 
 

@@ -82,10 +82,89 @@ def test_cameras_that_a_file_does_not_tell(meta, drop, message, tmp_path):
         load_cameras(folder)
 
 
-def test_cameras_of_two_sizes_are_refused(tmp_path):
+def test_cameras_of_two_sizes_have_each_their_own(tmp_path):
     frames = [{"file_path": f"{i}.png", "transform_matrix": pose, "w": 16 + i} for i, pose in enumerate(POSES)]
-    with pytest.raises(ValueError, match=r"one w and h .*'16 x 12', '17 x 12'"):
-        load_cameras(_write(tmp_path / "c", meta={"frames": frames}))
+    cameras = load_cameras(_write(tmp_path / "c", meta={"frames": frames}))
+    assert cameras.sizes.tolist() == [[16, 12], [17, 12], [18, 12]]
+    del frames[1]["w"]
+    with pytest.raises(ValueError, match=r"one w and h in pixels for each frame, got None x 12 for 1\.png"):
+        load_cameras(_write(tmp_path / "d", meta={"frames": frames}, drop=("w",)))
+
+
+FISHEYE = {"k1": 0.05, "k2": -0.01, "k3": 0.002, "k4": -0.0005, "p1": 0, "p2": 0}
+
+
+@pytest.mark.parametrize(
+    "meta",
+    [
+        {**FISHEYE, "camera_model": "OPENCV_FISHEYE"},  # nerfstudio
+        {**FISHEYE, "camera_model": None, "is_fisheye": True, "camera_angle_x": 2.2},  # instant-ngp
+        {**FISHEYE, "camera_model": "OPENCV_FISHEYE", "is_fisheye": True},
+        {"camera_model": "OPENCV_FISHEYE", "distortion_params": [0.05, -0.01, 0.002, -0.0005, 0, 0]},
+    ],
+)
+def test_a_fisheye_is_read_as_one(tmp_path, meta):
+    """A point 45 degrees off the axis lands at theta (1 + k1 theta^2 + ...), written out here."""
+    folder = _write(tmp_path / "c", meta=meta)
+    for cameras in (load_cameras(folder), load_capture(folder, downscale=1, normalize=False).cameras):
+        assert cameras.fisheye.all()
+        assert cameras.distortion[0].tolist() == [0.05, -0.01, 0.002, -0.0005, 0, 0]
+        theta = math.pi / 4
+        radius = theta * (1 + 0.05 * theta**2 - 0.01 * theta**4 + 0.002 * theta**6 - 0.0005 * theta**8)
+        pixels, _, _ = cameras.project(0, cameras.origins[0] + [1.0, 0.0, -1.0])
+        np.testing.assert_allclose(pixels, [8 + 20 * radius, 6])
+
+
+@pytest.mark.parametrize(
+    ("meta", "message"),
+    [
+        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model 'EQUIRECTANGULAR' .*undistort"),
+        ({"camera_model": "FISHEYE624"}, "camera_model 'FISHEYE624' .*undistort"),
+        ({"camera_model": "THIN_PRISM_FISHEYE"}, "camera_model 'THIN_PRISM_FISHEYE' .*undistort"),
+        ({"camera_model": "FOV"}, "camera_model 'FOV' of images/0.png is none of"),
+        ({"camera_model": "FULL_OPENCV", "k4": 0.1}, "distortion .* but camera_model FULL_OPENCV"),
+        ({"camera_model": "OPENCV_FISHEYE", "p1": 0.1}, "distortion .* but camera_model OPENCV_FISHEYE"),
+        ({"camera_model": "SIMPLE_RADIAL_FISHEYE", "k2": 0.1}, "but camera_model SIMPLE_RADIAL_FISHEYE"),
+        ({"camera_model": ["PINHOLE"]}, "camera_model .'PINHOLE'. of images/0.png is none of"),
+        ({"is_fisheye": True}, "is_fisheye True but camera_model OPENCV: which"),
+        ({"camera_model": "OPENCV_FISHEYE", "is_fisheye": False}, "is_fisheye False but camera_model OPENCV_FISHEYE"),
+        ({"is_fisheye": "yes"}, "is_fisheye of images/0.png must be true or false, got 'yes'"),
+        ({"ftheta_p0": 0, "ftheta_p1": 0.01}, "ftheta_p1 0.01, an f-theta lens"),
+        ({"latlong": True}, "latlong True, a panorama"),
+        ({"is_latlong": True}, "is_latlong True"),
+        ({"equirectangular": True}, "equirectangular True"),
+        ({"rolling_shutter": [0, 0, 0.03, 0]}, r"rolling_shutter \[0, 0, 0.03, 0\], a pose for each row"),
+        ({"k5": 0.1}, "k5 0.1"),
+        ({"distortion_params": [0.1] * 12}, "distortion_params of images/0.png must be k1, k2, k3, k4, p1, p2"),
+    ],
+)
+def test_lenses_that_are_not_read_are_refused_by_name(tmp_path, meta, message):
+    folder = _write(tmp_path / "c", meta=meta)
+    for read in (load_cameras, load_capture):
+        with pytest.raises(ValueError, match=message):
+            read(folder)
+
+
+def test_lens_flags_that_are_off_mean_nothing(tmp_path):
+    off = {"is_fisheye": False, "latlong": False, "rolling_shutter": [0, 0, 0, 0], "k5": 0, "distortion_params": None}
+    cameras = load_cameras(_write(tmp_path / "c", meta=off))
+    assert not cameras.fisheye.any()
+    assert cameras.distortion[0].tolist() == [0.03, 0, 0, 0, 0, 0]
+
+
+def test_field_of_view_of_both_sides(tmp_path):
+    angles = {"camera_angle_x": math.pi / 2, "y_fov": 90.0}
+    cameras = load_cameras(_write(tmp_path / "c", meta=angles, drop=("fl_x", "fl_y")))
+    np.testing.assert_allclose(cameras.intrinsics[0], [8, 6, 8, 6])
+    meta = {"camera_model": "OPENCV_FISHEYE", **angles}
+    with pytest.raises(ValueError, match="is a fisheye and needs fl_x in pixels; camera_angle_x is a pinhole's"):
+        load_cameras(_write(tmp_path / "d", meta=meta, drop=("fl_x", "fl_y")))
+
+
+def test_a_crop_that_is_not_read_is_named(tmp_path):
+    folder = _write(tmp_path / "c", meta={"camera_model": "OPENCV_FISHEYE", "fisheye_crop_radius": 7.0})
+    with pytest.warns(UserWarning, match="fisheye_crop_radius is not read"):
+        load_cameras(folder)
 
 
 def test_normalised_origins_fill_the_unit_box_and_the_transform_says_how(tmp_path):

@@ -139,3 +139,40 @@ def test_numbers_survive_to_the_last_bit(tmp_path):
     np.testing.assert_array_equal(again.cameras.distortion, cameras.distortion)
     assert again.split("train").tolist() == [0]
     assert json.loads((tmp_path / "transforms.json").read_text())["note"] == "text"
+
+
+def test_fisheyes_are_written_as_fisheyes(tmp_path):
+    bend = np.array([0.05, -0.01, 0.002, -0.0005, 0, 0])
+    cameras = Cameras.create(_poses(3), np.array([10.0, 11.0, 8.0, 6.0]), 16, 12, bend, fisheye=True)
+    names = [f"{number}.png" for number in range(3)]
+    write_transforms(tmp_path / "transforms.json", cameras, names, {})
+    for name in names:
+        Image.new("RGB", (16, 12)).save(tmp_path / name)
+    meta = json.loads((tmp_path / "transforms.json").read_text())
+    assert (meta["camera_model"], meta["k4"], meta["w"]) == ("OPENCV_FISHEYE", -0.0005, 16)
+    capture = whole(tmp_path)
+    assert capture.cameras.fisheye.all()
+    write_nerfstudio(capture, tmp_path / "out", train=[0, 1], evaluation=[2])
+    assert json.loads((tmp_path / "out" / "transforms.json").read_text())["camera_model"] == "OPENCV_FISHEYE"
+    np.testing.assert_array_equal(whole(tmp_path / "out").cameras.rays(1)[1], cameras.rays(1)[1])
+    some = Cameras.create(_poses(3), np.ones(4), 16, 12, fisheye=[True, False, False])
+    with pytest.raises(ValueError, match=r"1 of the 3 cameras are fisheyes .*one camera_model a file"):
+        write_transforms(tmp_path / "some.json", some, names, {})
+    assert not (tmp_path / "some.json").exists()
+
+
+def test_sizes_that_differ_stand_with_each_frame(tmp_path):
+    width, height = [16, 12, 16], [12, 16, 12]
+    cameras = Cameras.create(_poses(3), np.array([10.0, 10.0, 7.0, 7.0]), width, height)
+    names = [f"{number}.png" for number in range(3)]
+    write_transforms(tmp_path / "transforms.json", cameras, names, {"train_filenames": names[:1]})
+    for name, size in zip(names, zip(width, height)):
+        Image.new("RGB", size).save(tmp_path / name)
+    meta = json.loads((tmp_path / "transforms.json").read_text())
+    assert not {"w", "h"} & set(meta)
+    assert [(frame["w"], frame["h"]) for frame in meta["frames"]] == list(zip(width, height))
+    assert meta["fl_x"] == 10.0
+    write_nerfstudio(whole(tmp_path), tmp_path / "out", train=[0, 1], evaluation=[2])
+    again = whole(tmp_path / "out")
+    np.testing.assert_array_equal(again.cameras.sizes, cameras.sizes)
+    np.testing.assert_array_equal(again.cameras.intrinsics, cameras.intrinsics)

@@ -210,8 +210,8 @@ def test_foreign_files_are_refused(tmp_path):
     _rewrite(path, manifest={"format": "unghost-keep-mask"})
     with pytest.raises(ValueError, match="format must be 'unghost-pseudo-gt'"):
         load_pseudo_truth(path)
-    _rewrite(path, manifest={"format": "unghost-pseudo-gt", "format_version": 2})
-    with pytest.raises(ValueError, match="has version 2, this release reads 1"):
+    _rewrite(path, manifest={"format": "unghost-pseudo-gt", "format_version": 3})
+    with pytest.raises(ValueError, match="has version 3, this release reads 1 and 2"):
         load_pseudo_truth(path)
 
 

@@ -105,9 +105,10 @@ class MaskedProtocol:
         maps = self.stored
         (chosen,) = match_names("masks", maps.names, (name,), where=MASKS_VARIABLE, whole=False)
         index = maps.names.index(chosen)
-        visible = maps.visible(occlusion=maps.seen_open is not None)[index : index + 1]
+        view = (slice(index, index + 1), *maps.eval_cameras.window(index))
+        visible = maps.visible(occlusion=maps.seen_open is not None)[view]
         cameras = maps.eval_cameras.select([index])
-        depth, normals = maps.depth[index : index + 1], maps.normals[index : index + 1]
+        depth, normals = maps.depth[view], maps.normals[view]
         return Truth(photo, visible, depth, normals, cameras, (name,)), maps.extent
 
     def _keys(self, renders: Renders, truth: Truth) -> tuple[str, ...]:
