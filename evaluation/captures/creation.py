@@ -51,6 +51,8 @@ def make_capture(
         FileNotFoundError, ValueError, ImportError: of the steps.
     """
     how = settings or PosingSettings()
+    if frames < 1:
+        raise InvalidArgument(f"make_capture: frames must be >= 1, got {frames}")
     sources = {"train": Path(train), "eval": Path(evaluation)}
     for sweep, source in sources.items():
         if not source.exists():

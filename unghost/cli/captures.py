@@ -75,8 +75,9 @@ def convert(
 ) -> None:
     """Say how hard a capture's evaluation is and, with --out, write it as stock nerfstudio reads it.
 
-    Reads transforms.json folders (the released Nerfbusters captures with their frame_1_... names too) and COLMAP
-    models. Writes photos, poses, and the train, val and test lists that override nerfstudio's --eval-mode.
+    Reads transforms.json folders (the released Nerfbusters captures with their frame_1_... names too),
+    transforms_train.json and its siblings, and COLMAP models. Writes photos, poses, and the train, val and test lists
+    that override nerfstudio's --eval-mode; masks, depths and points that transforms.json names go along.
 
     Args:
         capture: folder with transforms.json, or with a COLMAP model in sparse/0 and photos in images.
@@ -85,7 +86,7 @@ def convert(
         eval_split: the sweep to be scored on: "eval", else "test" or "val", unless told otherwise.
         every: in place of eval_split: hold out every so many-th photo of train_split (8 is what most papers do).
         splits: JSON file of sweeps, {"name": ["images/a.jpg", ...], ...}, in place of what the capture says.
-        photos: folder that holds the photos, if they are not where the capture says.
+        photos: folder that holds the photos, if they are not where the capture says; smaller copies will do.
         missing: "drop" leaves photos out that are not there, and counts them.
         link: symbolic links to the photos instead of copies.
         plot: PNG for a bird's-eye view of both sweeps.
@@ -98,6 +99,8 @@ def convert(
         _check_plot(plot, "convert")
     if every is not None and eval_split is not None:
         raise InvalidArgument("convert: --every takes its photos from the training sweep: leave --eval-split out")
+    if every is not None and every < 2:
+        raise InvalidArgument(f"convert: --every must be >= 2, got {every}")
     posed, told = _read(capture, splits, missing, photos)
     print("\n".join(told), end="\n" if told else "")
     if every is None:
@@ -112,7 +115,10 @@ def convert(
         print(f"{len(train) + len(evaluation) - both} photos are in both sweeps: they were trained on")
     _report(posed, train, evaluation, plot, held_out=every)
     if out is not None:
-        write_nerfstudio(posed, out, train=train, evaluation=evaluation, photos="link" if link else "copy")
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            write_nerfstudio(posed, out, train=train, evaluation=evaluation, photos="link" if link else "copy")
+        print("".join(f"{each.message}\n" for each in caught), end="")
         print(f"{out}: ns-train nerfacto --data {out}")
 
 

@@ -205,7 +205,7 @@ def test_convert_takes_lists_and_leaves_missing_photos_out(three_sweeps, tmp_pat
         ((), "--train-split must say which sweep is meant; the capture has walk, back, third"),
         (("--train-split", "walk"), "--eval-split must say which sweep is meant"),
         (("--train-split", "walk", "--eval-split", "nope"), "no split 'nope'; choose from walk, back, third, all"),
-        (("--train-split", "walk", "--every", 1), "n >= 2, got 9 and 1"),
+        (("--train-split", "walk", "--every", 1), "--every must be >= 2, got 1"),
         (("--train-split", "walk", "--every", 8, "--eval-split", "back"), "leave --eval-split out"),
         (("--train-split", "third", "--every", 8), "train has no cameras: the measure is not defined"),
         (("--splits", "gone.json"), "has no gone.json"),

@@ -57,7 +57,7 @@ def test_boxes_are_left_alone_or_taken_back(cleaned, capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--keep-box", "1", "0", "0", "0", "1", "1"], "keep_boxes"),
+        (["--keep-box", "1", "0", "0", "0", "1", "1"], "--keep-box"),
         (["--mask", "g-clean.npz"], "is not a keep mask"),
         (["--mask", "g-keep.npz", "--keep", "g-keep.npz"], "mask and keep are the same file"),
         (["--mask", "other.npz"], "clean: the mask's box must be g.npz's"),
