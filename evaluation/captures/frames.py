@@ -117,15 +117,26 @@ def _sharpest(pictures: Iterable[tuple[Any, NDArray[Any]]], total: int, count: i
         yield best[1:]
 
 
-def _libraries(*names: str) -> list[Any]:
-    try:
-        return [importlib.import_module(name) for name in names]
-    except ImportError as error:
-        raise MissingExtra(f"extract_frames: needs {error.name}: pip install unghost[capture]") from error
+def import_libraries(*names: str) -> list[Any]:
+    """Modules from outside.
+
+    Raises:
+        ImportError: one is missing (names the extra), or is there and does not load (says why).
+    """
+    modules = []
+    for name in names:
+        try:
+            modules.append(importlib.import_module(name))
+        except ModuleNotFoundError as error:
+            raise MissingExtra(f"extract_frames: needs {error.name}: pip install unghost[capture]") from error
+        except Exception as error:  # a compiled part, or a library of the system
+            reason = " ".join(str(error).split())
+            raise MissingExtra(f"extract_frames: {name} is installed and does not load ({reason})") from error
+    return modules
 
 
 def _from_video(source: Path, folder: Path, prefix: str, count: int) -> _Found:
-    av, image = _libraries("av", "PIL.Image")
+    av, image = import_libraries("av", "PIL.Image")
     pictures: list[tuple[Path, int | str, tuple[int, int]]] = []
     seen = 0
 
@@ -154,7 +165,7 @@ def _from_video(source: Path, folder: Path, prefix: str, count: int) -> _Found:
 
 
 def _from_folder(source: Path, folder: Path, prefix: str, count: int) -> _Found:
-    image, operations = _libraries("PIL.Image", "PIL.ImageOps")
+    image, operations = import_libraries("PIL.Image", "PIL.ImageOps")
     files = [path for path in source.iterdir() if path.is_file()]
     photos = sorted(filter(is_photo, files), key=_natural)
     warn_of_unread(files, caller="extract_frames")

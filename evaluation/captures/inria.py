@@ -32,8 +32,8 @@ def cameras_as_frames(cameras: Sequence[Any], label: str) -> dict[str, Any]:
         >>> entry = {"id": 0, "img_name": "a", "width": 64, "height": 48, "fx": 60.0, "fy": 61.0,
         ...          "position": [1, 2, 3], "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}
         >>> frame, = cameras_as_frames([entry], "cameras.json")["frames"]
-        >>> [row[:3] for row in frame["transform_matrix"][:3]]  # looks along its -Z: +Z of the world
-        [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]
+        >>> np.array(frame["transform_matrix"]).diagonal().tolist()  # looks along its -Z, which is +Z of the world
+        [1.0, -1.0, -1.0, 1.0]
     """
     names = [each.get("img_name") if isinstance(each, dict) else None for each in cameras]
     times = Counter(names)
