@@ -71,7 +71,7 @@ def test_photos_of_other_proportions_are_still_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "start", ["C:\\Users\\me\\room\\images\\", "/home/me/room/images/", "../room/images/", "D:/elsewhere/"]
+    "start", ["E:\\mine\\room\\images\\", "/data/mine/room/images/", "../room/images/", "D:/elsewhere/"]
 )
 def test_paths_of_another_machine_lead_to_the_photos_here(tmp_path, start):
     folder = capture(tmp_path / "c", [f"{start}a.png", f"{start}b.png"])

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from unghost import cli
-from unghost.cli import cleaning
 from unghost.cleaning.keep_mask import KeepMask
+from unghost.cli import cleaning
 from unghost.fields.adapters.grids import load_grid, save_grid
 
 BOX = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
