@@ -148,8 +148,9 @@ def load_capture(
             (:func:`~unghost.evaluation.captures.splits.resolve_splits`).
         missing: ``"error"``, or ``"drop"`` for photos that are not there: they are left out with a warning that
             counts them, and stand in ``Capture.dropped``.
-        photos: folder that the photos' names refer to, if not ``folder`` (for COLMAP: ``images`` in it). Its photos
-            may be smaller than the cameras state: the lenses are scaled to them.
+        photos: folder that the photos' names refer to, if not ``folder`` (for COLMAP: ``images`` in it); it may be
+            named from ``folder`` (``images_4``). Its photos may be smaller than the cameras state: the lenses are
+            scaled to them.
         background: grey level in [0, 1] behind transparent pixels: white (1.0), as scores on the synthetic NeRF
             scenes have it; None refuses such photos.
 
@@ -181,8 +182,9 @@ def load_capture(
         raise InvalidArgument(f"load_capture: background must be in [0, 1] or None, got {background}")
     meta, label, root = _source(source)
     frames, names, poses = read_frames(meta, f"{label} in {source}")
-    found, resizable = find_photos(names, root, elsewhere=None if photos is None else Path(photos))
-    dropped = report_missing(names, found, label, Path(photos or root), missing)
+    elsewhere = None if photos is None else _photos_folder(Path(photos), source)
+    found, resizable = find_photos(names, root, elsewhere=elsewhere)
+    dropped = report_missing(names, found, label, elsewhere or root, missing)
     here = [number for number, path in enumerate(found) if path is not None]
     own = tuple(meta["frames"][k] for k in here)
     frames, names, poses = [frames[k] for k in here], tuple(names[k] for k in here), poses[here]
@@ -284,6 +286,18 @@ def _with_sizes(frames: Sequence[dict[str, Any]], names: Sequence[str], root: Pa
             stored, _, _ = photo_sizes(path, caller="load_cameras")
             sized[number] = {**frames[number], "w": stored[0], "h": stored[1]}
     return sized
+
+
+def _photos_folder(photos: Path, capture: Path) -> Path:
+    """The folder that is meant: from where the process runs, or else from the capture (``images_4``).
+
+    Raises:
+        FileNotFoundError: there is neither.
+    """
+    for folder in (photos, capture / photos):
+        if folder.is_dir():
+            return folder
+    raise MissingFile(f"load_capture: no folder {photos} with photos, neither here nor in {capture}")
 
 
 def _has_images(folder: Path) -> bool:

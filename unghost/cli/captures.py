@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -30,7 +31,8 @@ def capture(
     """Make a capture from two videos (or two folders of photos): one to train on, one to be scored on.
 
     The sharpest frames are kept, both sweeps are posed together by COLMAP (on the CPU; 2 x 100 frames take half an
-    hour or more on two cores), and the folder can be read by unghost and by stock nerfstudio.
+    hour or more on two cores), and the folder can be read by unghost and by stock nerfstudio. After a crash or Ctrl-C
+    the same call goes on from what was computed, which is beside OUT.
 
     Args:
         train: video or folder of photos to train on.
@@ -49,7 +51,11 @@ def capture(
         def progress(stage: str, done: int, total: int) -> None:
             bars(done, total, stage=stage, unit="pair" if stage == "pairs" else "photo")
 
-        told = make_capture(train, evaluation, out, frames=frames, settings=settings, progress=progress)
+        try:
+            told = make_capture(train, evaluation, out, frames=frames, settings=settings, progress=progress)
+        except KeyboardInterrupt:
+            print(f"what was computed is kept beside {out}: the same call goes on from there", file=sys.stderr)
+            raise
     for sweep in ("train", "eval"):
         each = told[sweep]
         print(f"{sweep}: {each['seen']} pictures in {each['source']}, {each['kept']} kept, {each['posed']} posed")

@@ -97,7 +97,8 @@ def option_names(verb: Callable[..., Any]) -> set[str]:
 def in_options(message: str, names: Collection[str]) -> str:
     """An error message of the library with its arguments written as the options of a verb.
 
-    Rewritten are ``name='value'``, "see name", "name must be", and every name of two words or more.
+    Rewritten are ``name='value'``, "see name", "name must be", and every name of two words or more. A hint in brackets
+    that begins with ``name='value'`` goes where the verb has no such option.
 
     Args:
         message: one line.
@@ -109,6 +110,9 @@ def in_options(message: str, names: Collection[str]) -> str:
         >>> in_options("load: downscale must be >= 1 for the best downscale", {"downscale"})
         'load: --downscale must be >= 1 for the best downscale'
     """
+    message = re.sub(
+        r" \(([a-z_]+)='[^']*'[^()]*\)", lambda each: each[0] if each[1] in (*names, *ALIASES) else "", message
+    )
     typed = {name: name for name in names} | {name: to for name, to in ALIASES.items() if to in names}
     if not typed:
         return message

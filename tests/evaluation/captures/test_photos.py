@@ -60,6 +60,15 @@ def test_the_lens_is_scaled_to_smaller_copies(tmp_path, elsewhere, ending):
     np.testing.assert_allclose(plain(tmp_path / "out").cameras.intrinsics, [wanted] * 2)
 
 
+def test_the_folder_of_photos_may_be_named_from_the_capture(tmp_path):
+    folder = capture(tmp_path / "c", ["images/a.png"])
+    photo(folder / "images" / "a.png")
+    photo(folder / "images_2" / "a.png", size=(32, 24))
+    assert plain(folder, photos="images_2").cameras.width == 32
+    with pytest.raises(FileNotFoundError, match=r"no folder images_9 with photos, neither here nor in .*c"):
+        plain(folder, photos="images_9")
+
+
 def test_photos_of_other_proportions_are_still_refused(tmp_path):
     folder = capture(tmp_path / "c", ["images/a.png"])
     photo(folder / "images_2" / "a.png", size=(32, 32))
@@ -131,6 +140,17 @@ def test_a_synthetic_nerf_scene_is_a_capture(tmp_path):
     assert meta["fl_x"] == pytest.approx(10 / np.tan(0.6911 / 2))
     assert meta["frames"][0]["rotation"] == 0.01
     assert "camera_angle_x" not in meta["frames"][0]
+
+
+def test_renders_are_scored_against_a_synthetic_nerf_scene(tmp_path, capsys):
+    from unghost import cli
+
+    folder = synthetic(tmp_path / "lego")
+    for name in ("r_0", "r_1"):
+        photo(tmp_path / "renders" / f"{name}.png", size=(20, 10))
+    words = [tmp_path / "renders", "--gt", folder, "--out", tmp_path / "page"]
+    assert cli.main(["evaluate", *map(str, words)]) == 0
+    assert "1 method, 2 views" in capsys.readouterr().out
 
 
 def test_one_photo_in_two_files_of_a_synthetic_scene_is_one_frame(tmp_path):

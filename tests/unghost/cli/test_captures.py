@@ -266,3 +266,16 @@ def test_capture_names_its_own_options(tmp_path, capsys):
     assert "--frames must be >= 1, got 0" in capsys.readouterr().err
     assert run("capture", tmp_path / "a", tmp_path / "b", "--out", tmp_path / "o", "--minimum-share", 2) == 2
     assert "--minimum-share must be in (0, 1], got 2" in capsys.readouterr().err
+
+
+def test_ctrl_c_says_that_nothing_is_lost(tmp_path, capsys, monkeypatch):
+    from unghost.evaluation.captures import creation
+
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(creation, "make_capture", interrupted)
+    assert run("capture", tmp_path, tmp_path, "--out", tmp_path / "out") == 130
+    said = capsys.readouterr().err
+    assert f"kept beside {tmp_path / 'out'}: the same call goes on from there" in said
+    assert said.endswith("unghost capture: interrupted\n")

@@ -89,6 +89,7 @@ def test_defaults_stand_in_the_help_and_falsy_values_count():
         ("photos must all have one size", "photos must all have one size"),  # no argument, but what it names
         ("no file out/eval_split, nor 'eval_split'", "no file out/eval_split, nor 'eval_split'"),
         ("the downscale of eval_split.json", "the downscale of eval_split.json"),
+        ("3 photos are gone (backend='torch' does it); left", "3 photos are gone; left"),  # no option of that name
         ("say --eval-split or --missing drop", "say --eval-split or --missing drop"),
     ],
 )
