@@ -19,7 +19,7 @@ from ...core.cameras import Cameras
 from ...core.errors import InvalidArgument, InvalidFile, MissingFile
 from ...core.io import read_json
 from .colmap import find_model, read_model
-from .dataparser import find_dataparser, into_the_trained_world
+from .dataparser import find_dataparser, into_the_trained_world, warn_if_exported
 from .inria import FILE as INRIA_FILE
 from .inria import cameras_as_frames
 from .photos import RESIZED, find_photos, fit_frames, photo_sizes, read_photo, report_missing
@@ -226,7 +226,7 @@ def load_cameras(path: str | Path, *, dataparser: str | Path | bool = True, scen
             or the photos must be there.
         dataparser: nerfstudio's ``dataparser_transforms.json``, which is applied to the cameras: fields of nerfstudio
             and splats of ``ns-export`` are in that world. True: the one beside ``path`` or beside ``scene``, if there
-            is one. False: none.
+            is one; a warning where there is none and the scene is splats that nerfstudio exported. False: none.
         scene: file of the scene that the cameras are for.
 
     Example:
@@ -249,7 +249,9 @@ def load_cameras(path: str | Path, *, dataparser: str | Path | bool = True, scen
     if dataparser is not False:
         beside = None if scene is None else Path(scene)
         moved = find_dataparser(place, beside) if dataparser is True else Path(dataparser)
-        if moved is not None:
+        if moved is None:
+            warn_if_exported(beside)
+        else:
             poses = into_the_trained_world(poses, meta, moved, root, colmap=colmap)
     merged = _with_sizes(merged, names, root)
     sizes = {f"{body.get('w')} x {body.get('h')}" for body in merged}
