@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core.aabb import as_aabb, scene_extent
 from ..core.arrays import is_tensor, to_numpy
-from ..core.cameras import Cameras, warn_if_turned_away
+from ..core.cameras import Cameras, warn_if_elsewhere, warn_if_turned_away
 from ..core.config import override
 from ..core.errors import InvalidArgument
 from ..core.lattice import lattice_origin, look_up_cells
@@ -278,6 +278,7 @@ def judge(
     check_denoiser(denoiser, caller="clean")
     warn_if_turned_away(cameras, box, caller="clean")
     _warn_if_unused(cameras, denoiser)
+    warn_if_elsewhere(cameras, box, caller="clean")
     pitch, shape = grid_of(box, s)
     query = make_query(density_fn, place=box.mean(axis=0), backend=s.backend, chunk=s.chunk, caller="clean")
     survey = survey_field(

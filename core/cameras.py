@@ -25,6 +25,7 @@ from .lenses import undistort as undistort
 FloatArray = NDArray[np.float64]
 
 FEW_CAMERAS, FEW_POINTS = 48, 6  # looked at, and along each axis of a box, where a glance is enough
+LEAST_SEEN, FARTHEST = 0.1, 8.0  # cameras of a scene see more of its box, and stand nearer to it (in diagonals)
 
 
 @dataclass(frozen=True, init=False)
@@ -406,15 +407,53 @@ def warn_if_turned_away(cameras: Cameras | None, aabb: FloatArray, *, caller: st
     """
     if cameras is None or len(cameras) == 0:
         return
-    some = cameras.select(np.unique(np.linspace(0, len(cameras) - 1, FEW_CAMERAS).round().astype(int)))
-    along = (np.arange(FEW_POINTS) + 0.5) / FEW_POINTS
-    lattice = aabb[0] + np.stack(np.meshgrid(along, along, along, indexing="ij"), axis=-1) * (aabb[1] - aabb[0])
-    turned = some.camera_to_world * np.array([1.0, -1.0, -1.0, 1.0])
-    other = some.moved(turned)
-    here, there = (float(rig.view_count(lattice).mean()) / len(some) for rig in (some, other))
-    if here < 0.1 * there and there > 0.02:
+    here, there, _ = _glance(cameras, aabb)
+    if _looks_away(here, there):
         warnings.warn(
             f"{caller}: the cameras have {here:.1%} of the aabb in view, and would have {there:.1%} with their y and z "
             "axes turned round: poses must be OpenGL's (+Y up, looking along -Z), not OpenCV's",
             stacklevel=3,
         )
+
+
+def warn_if_elsewhere(cameras: Cameras | None, aabb: FloatArray, *, caller: str) -> None:
+    """Warn if the cameras do not seem to belong to a box: they see hardly any of it, or stand very far from it.
+
+    Cameras of another world than the scene's (another unit, origin or orientation) do. Where
+    :func:`warn_if_turned_away` has the reason, nothing is said.
+
+    Args:
+        cameras: None for nothing to say.
+        aabb: ``(2, 3)``, where the scene is.
+        caller: for the text.
+    """
+    if cameras is None or len(cameras) == 0:
+        return
+    here, there, seen = _glance(cameras, aabb)
+    nearest = np.clip(cameras.origins, aabb[0], aabb[1])
+    away = np.linalg.norm(cameras.origins - nearest, axis=1) / max(float(np.linalg.norm(aabb[1] - aabb[0])), 1e-300)
+    far = float(np.median(away))
+    if _looks_away(here, there) or (seen >= LEAST_SEEN and far <= FARTHEST):
+        return
+    warnings.warn(
+        f"{caller}: the cameras do not fit the scene: together they have {seen:.0%} of its aabb in view, and half of "
+        f"them stand more than {far:.1f} of its diagonals away; they must be in the scene's own world (what nerfstudio "
+        "trained or exported is moved by its dataparser_transforms.json)",
+        stacklevel=3,
+    )
+
+
+def _looks_away(here: float, there: float) -> bool:
+    """Whether the share of a box in view, as the cameras are and turned round, says that they are turned round."""
+    return here < 0.1 * there and there > 0.02
+
+
+def _glance(cameras: Cameras, aabb: FloatArray) -> tuple[float, float, float]:
+    """Mean share of a box that a camera sees, that share with y and z turned round, and the share that any sees."""
+    some = cameras.select(np.unique(np.linspace(0, len(cameras) - 1, FEW_CAMERAS).round().astype(int)))
+    along = (np.arange(FEW_POINTS) + 0.5) / FEW_POINTS
+    lattice = aabb[0] + np.stack(np.meshgrid(along, along, along, indexing="ij"), axis=-1) * (aabb[1] - aabb[0])
+    turned = some.camera_to_world * np.array([1.0, -1.0, -1.0, 1.0])
+    other = some.moved(turned)
+    counts, reverse = some.view_count(lattice), other.view_count(lattice)
+    return float(counts.mean()) / len(some), float(reverse.mean()) / len(some), float((counts > 0).mean())

@@ -101,7 +101,7 @@ def write_json(path: str | Path, value: Any, *, parents: bool = True) -> None:
 
 
 def read_json(path: str | Path, *, caller: str) -> Any:
-    """Read a JSON file; ``caller`` begins the message of an error.
+    """Read a JSON file (UTF-8, or UTF-16 or -32 with a byte order mark); ``caller`` begins the message of an error.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -114,7 +114,7 @@ def read_json(path: str | Path, *, caller: str) -> Any:
     """
     source = Path(path)
     try:
-        return json.loads(source.read_text(encoding="utf-8"))
+        return json.loads(source.read_bytes())  # bytes: a byte order mark, which Windows editors write, is understood
     except (FileNotFoundError, NotADirectoryError):
         raise MissingFile(f"{caller}: no file {source}") from None
     except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:

@@ -28,17 +28,36 @@ LENSES = {  # COLMAP's camera models -> their parameters in order, by the names 
 PLACES = ("", "sparse", "colmap/sparse")  # where a model may be below the folder of a capture
 
 
+def import_pycolmap(caller: str) -> Any:
+    """pycolmap, from whichever of its distributions (``pycolmap``, ``pycolmap-cuda12``) is installed.
+
+    Raises:
+        ImportError: it is missing (names the extra), or it is there and does not load (says why).
+    """
+    try:
+        import pycolmap
+    except ModuleNotFoundError as error:
+        if error.name != "pycolmap":
+            raise MissingExtra(f"{caller}: pycolmap is installed and needs {error.name}, which is missing") from error
+        raise MissingExtra(f"{caller}: COLMAP needs pycolmap: pip install unghost[capture]") from error
+    except Exception as error:  # its own compiled part, or a library of the system that this wants
+        reasons = [str(each) for each in (error.__cause__, error.__context__, error) if each is not None]
+        reason = " ".join(reasons[0].split()) or type(error).__name__
+        raise MissingExtra(
+            f"{caller}: pycolmap is installed and does not load ({reason}); pip install --force-reinstall pycolmap "
+            "is the build for the CPU"
+        ) from error
+    return pycolmap
+
+
 @contextmanager
 def quiet_pycolmap(caller: str) -> Iterator[Any]:
     """pycolmap without its chatter, which comes back afterwards.
 
     Raises:
-        ImportError: it is missing (names the extra).
+        ImportError: it is missing (names the extra), or it is there and does not load (says why).
     """
-    try:
-        import pycolmap
-    except ImportError as error:
-        raise MissingExtra(f"{caller}: COLMAP needs pycolmap: pip install unghost[capture]") from error
+    pycolmap = import_pycolmap(caller)
     before = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     try:
@@ -98,8 +117,12 @@ def read_model(folder: str | Path, *, prefix: str = "") -> dict[str, Any]:
     if ending is None:
         raise InvalidFile(f"read_model: {source} has no cameras and images, .bin or .txt: not a COLMAP model")
     with quiet_pycolmap("read_model") as pycolmap, tempfile.TemporaryDirectory() as scratch:
-        for name in ("cameras", "images"):
-            shutil.copyfile(source / f"{name}{ending}", Path(scratch, f"{name}{ending}"))
+        shutil.copyfile(source / f"cameras{ending}", Path(scratch, f"cameras{ending}"))
+        names: dict[str, str] | None = None
+        if ending == ".txt":
+            names = _rename(source / "images.txt", Path(scratch, "images.txt"))
+        else:
+            shutil.copyfile(source / "images.bin", Path(scratch, "images.bin"))
         # No points: they are not needed, and a file of them that is cut short would take the process down.
         Path(scratch, f"points3D{ending}").write_bytes(bytes(8) if ending == ".bin" else b"")
         try:
@@ -107,16 +130,45 @@ def read_model(folder: str | Path, *, prefix: str = "") -> dict[str, Any]:
         except Exception as error:  # whatever the library makes of bad bytes
             reason = str(error).replace(scratch, str(source)).splitlines()[0]
             raise InvalidFile(f"read_model: {source} is no COLMAP model that can be read ({reason})") from None
-    photos = sorted((each for each in model.images.values() if each.has_pose), key=lambda each: each.name)
+    posed = [
+        (each.name if names is None else names[each.name], each) for each in model.images.values() if each.has_pose
+    ]
+    photos = sorted(posed, key=lambda pair: pair[0])
     if not photos:
         raise InvalidFile(f"read_model: {source} has no photo with a pose")
-    used = {photo.camera_id for photo in photos}
+    used = {photo.camera_id for _, photo in photos}
     lenses = {number: lens_of(camera, source) for number, camera in model.cameras.items() if number in used}
     frames = []
-    for photo in photos:
+    for name, photo in photos:
         pose = photo.cam_from_world().inverse().matrix() * np.array([1.0, -1.0, -1.0, 1.0])
-        frames.append({"file_path": prefix + photo.name, **lenses[photo.camera_id], "transform_matrix": pose.tolist()})
+        frames.append({"file_path": prefix + name, **lenses[photo.camera_id], "transform_matrix": pose.tolist()})
     return {"frames": frames}
+
+
+def _rename(source: Path, target: Path) -> dict[str, str]:
+    """Copy ``images.txt`` with names that have no spaces: COLMAP's reader ends a name at the first.
+
+    A photo is a line ``ID QW QX QY QZ TX TY TZ CAMERA_ID NAME``, with the name up to its end, and a line of points
+    (which are left out). Comments and blank lines may stand before a photo.
+
+    Returns:
+        The new names -> those of the file.
+    """
+    lines = iter(source.read_text(encoding="utf-8-sig", errors="surrogateescape").split("\n"))
+    names: dict[str, str] = {}
+    written = []
+    for line in lines:
+        words = line.strip().split(None, 9)
+        if not words or words[0].startswith("#"):
+            continue
+        if len(words) < 10:
+            raise InvalidFile(f"read_model: {source} has a line that is no photo: {line.strip()[:60]!r}")
+        key = f"{len(names):09d}"
+        names[key] = words[9]
+        written += [" ".join([*words[:9], key]), ""]
+        next(lines, None)
+    target.write_text("\n".join(written) + "\n", encoding="utf-8")
+    return names
 
 
 def lens_of(camera: Any, source: Path) -> dict[str, Any]:

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from ...core.errors import InvalidArgument, MissingFile
 from ...core.io import new_folder, write_json
-from .frames import Extraction, extract_frames
+from .colmap import import_pycolmap
+from .frames import Extraction, extract_frames, import_libraries
 from .loading import load_capture
 from .nerfstudio import file_lists, write_splits
-from .posing import Posing, PosingSettings, Progress, pose_jointly
+from .posing import NotJoinedError, Posing, PosingSettings, Progress, check_pycolmap, pose_jointly
+from .resuming import IMAGES, read_extractions, work_folder, write_extractions
 from .transforms import write_transforms
 
 PREFIXES = {"train": "frame_", "eval": "frame_1_"}  # the names of the released Nerfbusters captures
@@ -37,7 +38,8 @@ def make_capture(
 
     Args:
         train, evaluation: a video, or a folder of photos, each. All pictures must have one size.
-        out: must not exist, or be empty. Written whole or not at all.
+        out: must not exist, or be empty. Written whole or not at all. Until then, frames, features, matches and
+            models are in ``OUT.xxxxxxxx.work`` beside it: after a crash, the same call goes on from there.
         frames: at most so many are kept of each sweep.
         settings: of the posing.
         progress: as in :func:`~unghost.evaluation.captures.posing.pose_jointly`.
@@ -51,17 +53,25 @@ def make_capture(
         FileNotFoundError, ValueError, ImportError: of the steps.
     """
     how = settings or PosingSettings()
+    if frames < 1:
+        raise InvalidArgument(f"make_capture: frames must be >= 1, got {frames}")
     sources = {"train": Path(train), "eval": Path(evaluation)}
     for sweep, source in sources.items():
         if not source.exists():
             purpose = "to train on" if sweep == "train" else "to be scored on"
             raise MissingFile(f"make_capture: no video or folder {source} {purpose}")
-    with new_folder(Path(out)) as partial:
-        images = partial / "images"
-        taken = {
-            sweep: extract_frames(source, images, prefix=PREFIXES[sweep], count=frames)
-            for sweep, source in sources.items()
-        }
+    _check_libraries(sources)
+    with new_folder(Path(out)) as partial, work_folder(Path(out), sources, frames, how) as work:
+        images, stored = work / IMAGES, read_extractions(work)
+        if stored is None:
+            shutil.rmtree(images, ignore_errors=True)
+            taken = {
+                sweep: extract_frames(source, images, prefix=PREFIXES[sweep], count=frames)
+                for sweep, source in sources.items()
+            }
+            write_extractions(work, taken)
+        else:
+            taken = stored
         sizes = {sweep: f"{found.size[0]} x {found.size[1]}" for sweep, found in taken.items()}
         if len(set(sizes.values())) > 1:
             raise InvalidArgument(
@@ -70,7 +80,12 @@ def make_capture(
             )
         names = {sweep: [path.name for path in found.paths] for sweep, found in taken.items()}
         try:
-            posing = pose_jointly(images, names, out=partial / MODEL, settings=how, progress=progress)
+            posing = pose_jointly(images, names, out=partial / MODEL, settings=how, progress=progress, work=work)
+        except NotJoinedError as error:
+            raise NotJoinedError(
+                f"{error}; what was computed is kept in {work}: the same call with a smaller minimum_share goes on "
+                "from there"
+            ) from None
         except ValueError as error:
             kept = {
                 source: _keep_frames(images, names[sweep], Path(f"{out}.{sweep}"))
@@ -83,6 +98,7 @@ def make_capture(
             raise InvalidArgument(
                 f"{error}; the frames are kept, {said}: a folder can be given in a video's place"
             ) from None
+        shutil.copytree(images, partial / "images")
         sweeps = {sweep: [f"images/{name}" for name in found] for sweep, found in posing.posed.items()}
         capture = load_capture(partial, downscale=1, normalize=False, splits=sweeps)
         write_transforms(
@@ -96,6 +112,19 @@ def make_capture(
         told = _told(sources, taken, posing, how)
         write_json(partial / "capture.json", told)
     return told
+
+
+def _check_libraries(sources: dict[str, Path]) -> dict[str, str]:
+    """The versions of what is needed, before minutes of work.
+
+    Raises:
+        ImportError: a library is missing, does not load, or is too old; names the extra or the reason.
+    """
+    videos = any(source.is_file() for source in sources.values())
+    names = ("av", "PIL.Image") if videos else ("PIL.Image",)
+    modules = {"pycolmap": check_pycolmap(import_pycolmap("make_capture"), caller="make_capture")}
+    modules |= dict(zip(names, import_libraries(*names)))
+    return {name: str(getattr(modules[name], "__version__", "?")) for name in ("pycolmap", "av") if name in modules}
 
 
 def _keep_frames(images: Path, names: list[str], beside: Path) -> Path:
@@ -124,6 +153,6 @@ def _told(
         "reprojection_error": posing.reprojection_error,
         "points": posing.points,
         "seed": how.seed,
-        "versions": {name: version(name) for name in ("pycolmap", "av")},
+        "versions": _check_libraries(sources),
         "frames": {path.name: was for each in taken.values() for path, was in zip(each.paths, each.sources)},
     }

@@ -18,10 +18,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.errors import InvalidArgument, InvalidFile, MissingExtra, MissingFile
-
-PHOTO_ENDINGS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
-JPEG = {"quality": 95, "subsampling": 0}
-EXIF_ORIENTATION = 0x0112
+from .photos import (
+    HEIC_ENDINGS,
+    JPEG,
+    PHOTO_ENDINGS,
+    check_heic,
+    exif_orientation,
+    is_photo,
+    pillow,
+    stored_name,
+    warn_of_unread,
+)
 
 
 @dataclass(frozen=True)
@@ -58,7 +65,8 @@ def extract_frames(source: str | Path, folder: str | Path, *, prefix: str, count
     """Keep the sharpest picture of each of ``count`` equal stretches of a video, or of a folder of photos.
 
     A folder of at most ``count`` photos is taken whole. Its photos are copied as they are, unless they are to be shown
-    turned (EXIF), as phones store them: then they are stored upright. Frames of a video become JPEGs, upright too.
+    turned (EXIF), as phones store them: then they are stored upright. HEIC photos and frames of a video become JPEGs,
+    upright too. Dot files are no photos; a warning counts pictures in formats that are not read.
 
     Args:
         source: a video that FFmpeg can read, or a folder (photos by name; folders in it are not entered).
@@ -69,7 +77,7 @@ def extract_frames(source: str | Path, folder: str | Path, *, prefix: str, count
     Raises:
         FileNotFoundError: no such video or folder.
         ValueError: one that has no pictures, cannot be decoded, or has pictures of several sizes.
-        ImportError: PyAV or Pillow is missing.
+        ImportError: PyAV or Pillow is missing, or pi-heif for HEIC photos.
     """
     origin, target = Path(source), Path(folder)
     if count < 1:
@@ -109,15 +117,26 @@ def _sharpest(pictures: Iterable[tuple[Any, NDArray[Any]]], total: int, count: i
         yield best[1:]
 
 
-def _libraries(*names: str) -> list[Any]:
-    try:
-        return [importlib.import_module(name) for name in names]
-    except ImportError as error:
-        raise MissingExtra(f"extract_frames: needs {error.name}: pip install unghost[capture]") from error
+def import_libraries(*names: str) -> list[Any]:
+    """Modules from outside.
+
+    Raises:
+        ImportError: one is missing (names the extra), or is there and does not load (says why).
+    """
+    modules = []
+    for name in names:
+        try:
+            modules.append(importlib.import_module(name))
+        except ModuleNotFoundError as error:
+            raise MissingExtra(f"extract_frames: needs {error.name}: pip install unghost[capture]") from error
+        except Exception as error:  # a compiled part, or a library of the system
+            reason = " ".join(str(error).split())
+            raise MissingExtra(f"extract_frames: {name} is installed and does not load ({reason})") from error
+    return modules
 
 
 def _from_video(source: Path, folder: Path, prefix: str, count: int) -> _Found:
-    av, image = _libraries("av", "PIL.Image")
+    av, image = import_libraries("av", "PIL.Image")
     pictures: list[tuple[Path, int | str, tuple[int, int]]] = []
     seen = 0
 
@@ -146,10 +165,14 @@ def _from_video(source: Path, folder: Path, prefix: str, count: int) -> _Found:
 
 
 def _from_folder(source: Path, folder: Path, prefix: str, count: int) -> _Found:
-    image, operations = _libraries("PIL.Image", "PIL.ImageOps")
-    photos = sorted((path for path in source.iterdir() if path.suffix.lower() in PHOTO_ENDINGS), key=_natural)
+    image, operations = import_libraries("PIL.Image", "PIL.ImageOps")
+    files = [path for path in source.iterdir() if path.is_file()]
+    photos = sorted(filter(is_photo, files), key=_natural)
+    warn_of_unread(files, caller="extract_frames")
     if not photos:
         raise InvalidFile(f"extract_frames: no photos in {source} (looked for {', '.join(PHOTO_ENDINGS)})")
+    check_heic(photos, caller="extract_frames")
+    image = pillow(caller="extract_frames")
     pictures: list[tuple[Path, int | str, tuple[int, int]]] = []
     try:
         if len(photos) > count:
@@ -158,15 +181,18 @@ def _from_folder(source: Path, folder: Path, prefix: str, count: int) -> _Found:
         else:
             chosen = photos
         for path in chosen:
-            written = folder / f"{prefix}{len(pictures) + 1:05d}{path.suffix.lower()}"
+            written = folder / stored_name(f"{prefix}{len(pictures) + 1:05d}{path.suffix.lower()}")
+            heic = path.suffix.lower() in HEIC_ENDINGS  # which neither COLMAP nor nerfstudio reads
             with image.open(path) as photo:
-                if photo.getexif().get(EXIF_ORIENTATION, 1) == 1:
+                if exif_orientation(photo) == 1 and not heic:
                     size = photo.size
                     shutil.copyfile(path, written)
                 else:
                     upright = operations.exif_transpose(photo)
                     size = upright.size
-                    upright.save(written, exif=upright.getexif(), **(JPEG if photo.format == "JPEG" else {}))
+                    jpeg = heic or photo.format == "JPEG"
+                    plain = upright.convert("RGB") if heic else upright
+                    plain.save(written, exif=upright.getexif(), **(JPEG if jpeg else {}))
             pictures.append((written, path.name, size))
     except OSError as error:
         raise InvalidFile(f"extract_frames: cannot read a photo of {source} ({error})") from None

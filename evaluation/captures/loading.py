@@ -6,6 +6,7 @@ OpenGL camera-to-world matrices, OPENCV or OPENCV_FISHEYE lenses, one for all ph
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,20 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.cameras import Cameras
-from ...core.errors import InvalidArgument, InvalidFile, MissingExtra, MissingFile
+from ...core.errors import InvalidArgument, InvalidFile, MissingFile
+from ...core.io import read_json
 from .colmap import find_model, read_model
+from .dataparser import find_dataparser, into_the_trained_world, warn_if_exported
+from .inria import FILE as INRIA_FILE
+from .inria import cameras_as_frames
+from .photos import RESIZED, find_photos, fit_frames, photo_sizes, read_photo, report_missing
 from .splits import Splits, resolve_splits
-from .transforms import read_frames, read_lens, read_object
+from .transforms import has_split_files, read_frames, read_lens, read_object, read_split_files
 
 MISSING = ("error", "drop")
-
-
-def _pillow() -> Any:
-    try:
-        from PIL import Image
-    except ImportError as error:
-        raise MissingExtra("load_capture needs Pillow to read photos: pip install unghost[eval]") from error
-    return Image
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +43,10 @@ class Capture:
             the identity if not normalised).
         scale_factor: ``f`` above: scene units for one unit of the file.
         dropped: photos that were named but not there, and left out as asked.
+        meta: what the file says beside its frames (empty for COLMAP), as it stands there.
+        frames: each photo's own frame, as it stands in the file.
+        upright: positions of the photos that are read turned, as their EXIF tags say.
+        background: grey level in [0, 1] behind transparent pixels; None refuses them.
 
     Example: see :func:`load_capture`; ``capture.split("eval")`` are the numbers of the photos of a sweep,
     ``capture.images([3])`` is a photo as ``(1, H, W, 3)`` float32 in [0, 1].
@@ -59,6 +61,10 @@ class Capture:
     _paths: tuple[Path, ...] = field(repr=False)
     _cache: dict[int, NDArray[np.float32]] = field(default_factory=dict, repr=False)
     dropped: tuple[str, ...] = ()
+    meta: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    frames: tuple[Mapping[str, Any], ...] = field(default=(), repr=False)
+    upright: frozenset[int] = field(default=frozenset(), repr=False)
+    background: float | None = 1.0
 
     def __len__(self) -> int:
         return len(self.names)
@@ -69,9 +75,9 @@ class Capture:
         return self._paths
 
     def photo_size(self, index: int) -> tuple[int, int]:
-        """Width and height of a photo as it is stored."""
-        with _pillow().open(self._paths[index]) as photo:
-            return int(photo.width), int(photo.height)
+        """Width and height of a photo as it is read: stored, or upright."""
+        stored, shown, _ = photo_sizes(self._paths[index], caller="Capture.photo_size")
+        return shown if index in self.upright else stored
 
     def split(self, name: str) -> NDArray[np.int64]:
         """Indices ``(n,)`` of the photos of one sweep, in its order; ``"all"`` is every photo.
@@ -92,7 +98,8 @@ class Capture:
         one size at a time (:meth:`~unghost.core.cameras.Cameras.by_size`).
 
         Raises:
-            ValueError: a photo cannot be decoded, or has transparent pixels; photos of different sizes.
+            ValueError: a photo cannot be decoded, or has transparent pixels and ``background`` is None; photos of
+                different sizes.
             IndexError: an index outside the capture.
         """
         everything = np.arange(len(self))
@@ -105,7 +112,12 @@ class Capture:
             )
         for index in chosen.tolist():
             if index not in self._cache:
-                self._cache[index] = _read_photo(self._paths[index], *sizes[0])
+                self._cache[index] = read_photo(
+                    self._paths[index],
+                    *sizes[0],
+                    upright=index in self.upright,
+                    background=self.background,
+                )
         if not len(chosen):
             return np.zeros((0, *self.cameras.sizes[0, ::-1], 3), "f4")
         return np.stack([self._cache[index] for index in chosen.tolist()])
@@ -125,12 +137,15 @@ def load_capture(
     splits: Splits | None = None,
     missing: str = "error",
     photos: str | Path | None = None,
+    background: float | None = 1.0,
 ) -> Capture:
     """Read a capture's poses, intrinsics and sweeps, and check that every photo is there; no photo is decoded.
 
     Args:
         folder: holds ``transforms.json`` and the photos its ``file_path`` entries name; or is a COLMAP model or has
-            one in ``sparse/0``, photos in ``images`` (needs ``unghost[capture]``).
+            one in ``sparse/0``, photos in ``images`` (needs ``unghost[capture]``); or holds ``transforms_train.json``
+            (``_val``, ``_test``), as the synthetic NeRF scenes do. Where there is no ``images`` but ``images_4``, say,
+            the photos are those, and the lenses are scaled to them.
         downscale: how many stored pixels make one, along each axis (>= 1). The size is rounded to whole
             pixels and the intrinsics follow, so 756 / 8 becomes 94 with fy 0.5 % smaller.
         normalize: as nerfstudio with ``--orientation-method none`` (its own default turns the scene first, and the
@@ -142,7 +157,11 @@ def load_capture(
             (:func:`~unghost.evaluation.captures.splits.resolve_splits`).
         missing: ``"error"``, or ``"drop"`` for photos that are not there: they are left out with a warning that
             counts them, and stand in ``Capture.dropped``.
-        photos: folder that the photos' names refer to, if not ``folder`` (for COLMAP: ``images`` in it).
+        photos: folder that the photos' names refer to, if not ``folder`` (for COLMAP: ``images`` in it); it may be
+            named from ``folder`` (``images_4``). Its photos may be smaller than the cameras state: the lenses are
+            scaled to them.
+        background: grey level in [0, 1] behind transparent pixels: white (1.0), as scores on the synthetic NeRF
+            scenes have it; None refuses such photos.
 
     Example:
         >>> import json, tempfile
@@ -168,27 +187,52 @@ def load_capture(
         raise InvalidArgument(f"load_capture: downscale must be >= 1, got {downscale}")
     if missing not in MISSING:
         raise InvalidArgument(f"load_capture: missing must be one of {', '.join(MISSING)}, got {missing!r}")
+    if background is not None and not 0 <= background <= 1:
+        raise InvalidArgument(f"load_capture: background must be in [0, 1] or None, got {background}")
     meta, label, root = _source(source)
     frames, names, poses = read_frames(meta, f"{label} in {source}")
-    found = [_photo_path(Path(photos or root), name) for name in names]
-    dropped = _dropped(names, found, label, Path(photos or root), missing)
+    elsewhere = None if photos is None else _photos_folder(Path(photos), source)
+    found, resizable = find_photos(names, root, elsewhere=elsewhere)
+    dropped = report_missing(names, found, label, elsewhere or root, missing)
     here = [number for number, path in enumerate(found) if path is not None]
+    own = tuple(meta["frames"][k] for k in here)
     frames, names, poses = [frames[k] for k in here], tuple(names[k] for k in here), poses[here]
     paths = tuple(path for path in found if path is not None)
-    sizes = [_check_photo(path, frame, name, label) for path, frame, name in zip(paths, frames, names)]
+    frames, upright = fit_frames(frames, paths, names, label, [resizable[k] for k in here])
     sweeps = resolve_splits(names, meta=meta, folder=root, given=splits, dropped=dropped)
     transform = _normalisation(poses[:, :3, 3], normalize, sweeps)
     poses[:, :3, 3] = poses[:, :3, 3] * transform[0, 0] + transform[:3, 3]
+    sizes = [(frame["w"], frame["h"]) for frame in frames]
     cameras = _cameras(poses, frames, names, sizes).resized(1.0 / downscale)
-    return Capture(source, names, cameras, sweeps, transform, float(transform[0, 0]), paths, dropped=dropped)
+    return Capture(
+        source,
+        names,
+        cameras,
+        sweeps,
+        transform,
+        float(transform[0, 0]),
+        paths,
+        dropped=dropped,
+        meta={key: value for key, value in meta.items() if key != "frames"},
+        frames=own,
+        upright=upright,
+        background=background,
+    )
 
 
-def load_cameras(path: str | Path) -> Cameras:
-    """The cameras of a ``transforms.json`` or a COLMAP model alone, in its own world: no photo need be there.
+def load_cameras(path: str | Path, *, dataparser: str | Path | bool = True, scene: str | Path | None = None) -> Cameras:
+    """The cameras of a capture alone, in its own world or, with nerfstudio's transform, in the trained one.
+
+    Reads ``transforms.json`` (and ``transforms_train.json`` and so on), a COLMAP model, or Inria's ``cameras.json``.
+    No photo need be there, unless the file states no size.
 
     Args:
-        path: the file, or a folder that holds one, or a model. It must state ``w`` and ``h``, for all
-            frames or for each.
+        path: the file, or a folder that holds one, or a model. It must state ``w`` and ``h``, for all frames or for
+            each, or the photos must be there.
+        dataparser: nerfstudio's ``dataparser_transforms.json``, which is applied to the cameras: fields of nerfstudio
+            and splats of ``ns-export`` are in that world. True: the one beside ``path`` or beside ``scene``, if there
+            is one; a warning where there is none and the scene is splats that nerfstudio exported. False: none.
+        scene: file of the scene that the cameras are for.
 
     Example:
         >>> import json, tempfile
@@ -204,11 +248,17 @@ def load_cameras(path: str | Path) -> Cameras:
         FileNotFoundError: there is none.
         ValueError: what is wrong with the file.
     """
-    file = Path(path) / "transforms.json" if Path(path).is_dir() else Path(path)
-    if not file.is_file() and not (Path(path).is_dir() and find_model(Path(path))):
-        raise MissingFile(f"load_cameras: no file {file}")
-    meta = read_object(file) if file.is_file() else _source(Path(path))[0]
+    place = Path(path)
+    meta, file, root, colmap = _cameras_source(place)
     merged, names, poses = read_frames(meta, str(file))
+    if dataparser is not False:
+        beside = None if scene is None else Path(scene)
+        moved = find_dataparser(place, beside) if dataparser is True else Path(dataparser)
+        if moved is None:
+            warn_if_exported(beside)
+        else:
+            poses = into_the_trained_world(poses, meta, moved, root, colmap=colmap)
+    merged = _with_sizes(merged, names, root)
     stated: list[Any] = [(body.get("w"), body.get("h")) for body in merged]
     for name, size in zip(names, stated):
         if not all(isinstance(side, (int, float)) and 1 <= side < np.inf for side in size):
@@ -234,50 +284,62 @@ def _cameras(
     return Cameras.create(poses, lens, width, height, bend, fisheye)
 
 
+def _cameras_source(place: Path) -> tuple[dict[str, Any], Path, Path, bool]:
+    """What a file or folder says of cameras, the file to name in errors, its folder, and whether it is COLMAP's."""
+    if place.is_dir() and not (place / "transforms.json").is_file():
+        if find_model(place) or has_split_files(place):
+            meta, label, root = _source(place)
+            return meta, place, root, "COLMAP" in label
+        place = place / (INRIA_FILE if (place / INRIA_FILE).is_file() else "transforms.json")
+    elif place.is_dir():
+        place = place / "transforms.json"
+    content = read_json(place, caller="load_cameras")
+    if isinstance(content, list):
+        return cameras_as_frames(content, str(place)), place, place.parent, False
+    return read_object(place, caller="load_cameras"), place, place.parent, False
+
+
+def _with_sizes(frames: Sequence[dict[str, Any]], names: Sequence[str], root: Path) -> list[dict[str, Any]]:
+    """Frames that state no size, with that of their photos where these are there."""
+    bare = [number for number, frame in enumerate(frames) if frame.get("w") is None or frame.get("h") is None]
+    sized = list(frames)
+    found, _ = find_photos([names[number] for number in bare], root)
+    for number, path in zip(bare, found):
+        if path is not None:
+            stored, _, _ = photo_sizes(path, caller="load_cameras")
+            sized[number] = {**frames[number], "w": stored[0], "h": stored[1]}
+    return sized
+
+
+def _photos_folder(photos: Path, capture: Path) -> Path:
+    """The folder that is meant: from where the process runs, or else from the capture (``images_4``).
+
+    Raises:
+        FileNotFoundError: there is neither.
+    """
+    for folder in (photos, capture / photos):
+        if folder.is_dir():
+            return folder
+    raise MissingFile(f"load_capture: no folder {photos} with photos, neither here nor in {capture}")
+
+
+def _has_images(folder: Path) -> bool:
+    """Whether photos lie in ``images``, or in smaller copies of it such as ``images_4``."""
+    inner = folder.iterdir() if folder.is_dir() else ()
+    return any((path.name == "images" or re.fullmatch(RESIZED, path.name)) and path.is_dir() for path in inner)
+
+
 def _source(folder: Path) -> tuple[dict[str, Any], str, Path]:
     """What a folder says of its photos, what to call that in errors, and where the photos' names start from."""
     model = None if (folder / "transforms.json").exists() else find_model(folder)
     if model is None:
+        if not (folder / "transforms.json").exists() and has_split_files(folder):
+            return read_split_files(folder), "transforms_train.json (_val, _test)", folder
         return read_object(folder / "transforms.json"), "transforms.json", folder
     places = [folder, *folder.resolve().parents[:2]] if model == folder else [folder]
-    root = next((place for place in places if (place / "images").is_dir()), folder)
-    prefix = "images/" if (root / "images").is_dir() else ""
+    root = next((place for place in places if _has_images(place)), folder)
+    prefix = "images/" if _has_images(root) else ""
     return read_model(model, prefix=prefix), f"the COLMAP model {model.name}", root
-
-
-def _photo_path(folder: Path, name: str) -> Path | None:
-    """``file_path`` without an extension is a PNG, as in the synthetic NeRF scenes."""
-    return next((path for path in (folder / name, folder / f"{name}.png") if path.is_file()), None)
-
-
-def _dropped(
-    names: Sequence[str], found: Sequence[Path | None], label: str, folder: Path, missing: str
-) -> tuple[str, ...]:
-    """The photos that are not there, after saying so."""
-    absent = tuple(name for name, path in zip(names, found) if path is None)
-    if not absent:
-        return ()
-    shown = ", ".join(absent[:5]) + (", …" if len(absent) > 5 else "")
-    told = f"load_capture: {len(absent)} of the {len(names)} photos that {label} names are not in {folder}: {shown}"
-    if missing == "error" or len(absent) == len(names):
-        raise MissingFile(told if len(absent) == len(names) else f"{told} (missing='drop' leaves them out)")
-    warnings.warn(f"{told}; left out", stacklevel=3)
-    return absent
-
-
-def _check_photo(path: Path, frame: Mapping[str, Any], name: str, label: str) -> tuple[int, int]:
-    image = _pillow()
-    try:
-        with image.open(path) as photo:
-            found = (int(photo.width), int(photo.height))
-    except OSError as error:
-        raise InvalidFile(f"load_capture: cannot read photo {path} ({error})") from None
-    stated = (int(frame.get("w", found[0])), int(frame.get("h", found[1])))
-    if found != stated:
-        raise InvalidFile(
-            f"load_capture: photo {name} is {found[0]} x {found[1]}, {label} says {stated[0]} x {stated[1]}"
-        )
-    return found
 
 
 def _normalisation(
@@ -301,15 +363,3 @@ def _normalisation(
     factor = 1.0 / reach if reach > 1e-9 else 1.0
     transform[:3] = np.concatenate([np.eye(3), -center[:, None]], axis=1) * factor
     return transform
-
-
-def _read_photo(path: Path, width: int, height: int) -> NDArray[np.float32]:
-    image = _pillow()
-    try:
-        with image.open(path) as photo:
-            if photo.mode in ("RGBA", "LA", "PA") and photo.getchannel("A").getextrema()[0] < 255:
-                raise InvalidFile(f"Capture.images: {path} has transparent pixels; put it on a background first")
-            small = photo.convert("RGB").resize((width, height), image.Resampling.BOX)
-            return np.asarray(small, dtype=np.float32) / np.float32(255)
-    except OSError as error:
-        raise InvalidFile(f"Capture.images: cannot decode {path} ({error})") from None

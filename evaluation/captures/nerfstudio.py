@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 
 from ...core.errors import InvalidArgument
 from ...core.io import new_folder, write_json
+from .carried import carry_file_keys, carry_frames
 from .loading import Capture
+from .photos import HEIC_ENDINGS, store_photo, stored_name
 from .transforms import write_transforms
 
 PHOTOS = ("copy", "link")
@@ -41,7 +43,11 @@ def write_nerfstudio(
 
     Photos of neither sweep are left out: nerfstudio scales the poses of *all* frames in the file to +-1, so that these
     are the two sweeps together, as the paper has it. Photos lie in ``images`` under their own names (with their
-    folders' where two have the same), as nerfstudio's downscaled copies need.
+    folders' where two have the same), as nerfstudio's downscaled copies need. HEIC photos, and those that were read
+    turned as their EXIF tags say, are stored anew, because nerfstudio would not read them so.
+
+    What else the capture's ``transforms.json`` and its frames say goes along: the files of ``mask_path``,
+    ``depth_file_path`` and ``ply_file_path`` (any key that ends in ``_path``) are put into the new folder, too.
 
     Args:
         capture: read with ``downscale=1, normalize=False``.
@@ -66,9 +72,17 @@ def write_nerfstudio(
         names = dict(zip(chosen, _flat_names([capture.paths[k] for k in chosen], [capture.names[k] for k in chosen])))
         (partial / "images").mkdir()
         for index, name in names.items():
-            source = capture.paths[index].resolve()
-            if photos == "link":
+            source, turned = capture.paths[index].resolve(), index in capture.upright
+            if photos == "link" and not turned and source.suffix.lower() not in HEIC_ENDINGS:
                 (partial / name).symlink_to(source)
+            else:
+                store_photo(source, partial / name, upright=turned)
+        frame_keys, beside = carry_frames([capture.frames[k] for k in chosen] if capture.frames else [], capture.folder)
+        file_keys, more = carry_file_keys(capture.meta, capture.folder)
+        for name, source in {**beside, **more}.items():
+            (partial / name).parent.mkdir(exist_ok=True)
+            if photos == "link":
+                (partial / name).symlink_to(source.resolve())
             else:
                 shutil.copyfile(source, partial / name)
         lists = {sweep: [names[k] for k in indices] for sweep, indices in sweeps.items()}
@@ -77,13 +91,15 @@ def write_nerfstudio(
             capture.cameras.select(chosen),
             [names[k] for k in chosen],
             file_lists(lists["train"], lists["eval"]),
+            frame_keys or None,
+            **file_keys,
         )
         write_splits(partial / "splits.json", lists)
 
 
 def _flat_names(paths: Sequence[Path], names: Sequence[str]) -> list[str]:
     """``images/<file>``, with the folders of the photo's name before it where files are called alike."""
-    files = [path.name for path in paths]
+    files = [stored_name(path.name) for path in paths]
     if len(set(files)) == len(files):
         return [f"images/{file}" for file in files]
     parts = [posixpath.dirname(name).removeprefix("images").split("/") for name in names]

@@ -2,19 +2,32 @@
 
 from __future__ import annotations
 
+import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-from ...core.errors import InvalidArgument
+from ...core.errors import InvalidArgument, MissingExtra
+from ...core.io import read_json, write_json
 from .colmap import quiet_pycolmap
 
 Progress = Callable[[str, int, int], None]
 EXTRACT_AT_ONCE, MATCH_AT_ONCE = 8, 500  # photos and pairs between two reports of progress
 SMALLEST_PART = 3  # photos
+NEEDED = (  # of pycolmap 4.2
+    *("extract_features", "match_image_pairs", "incremental_mapping", "ImportedPairingOptions", "CameraMode"),
+    *("FeatureExtractionOptions", "FeatureMatchingOptions", "ImageReaderOptions", "IncrementalPipelineOptions"),
+    *("TwoViewGeometryOptions", "Reconstruction", "Device"),
+)
+STATE, DATABASE, PARTS = "state.json", "database.db", "parts"
+
+
+class NotJoinedError(InvalidArgument):
+    """COLMAP posed photos, and no part has enough of each sweep: a smaller minimum share could do."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +82,7 @@ def pose_jointly(
     out: str | Path,
     settings: PosingSettings | None = None,
     progress: Progress | None = None,
+    work: Path | None = None,
 ) -> Posing:
     """Pose the photos of all sweeps in one world: SIFT features, every pair matched, incremental mapping, on the CPU.
 
@@ -81,9 +95,11 @@ def pose_jointly(
         out: folder for the model (``cameras.bin``, ``images.bin``, …, and its points in ``points3D.ply``).
         settings: None for the defaults.
         progress: called with a stage, how much of it is done, and how much there is.
+        work: folder for features, matches and models, which stays; a call with the same photos, sweeps and settings
+            goes on from what is there. None: a temporary one.
 
     Raises:
-        ImportError: pycolmap is missing.
+        ImportError: pycolmap is missing, does not load, or is too old.
         ValueError: no part has enough photos of every sweep; says how many each part has of each.
     """
     how = settings or PosingSettings()
@@ -94,12 +110,24 @@ def pose_jointly(
     if spaced is not None:
         raise InvalidArgument(f"pose_jointly: names of photos must have no spaces in them, got {spaced!r}")
     tell = progress or (lambda stage, done, total: None)
-    with quiet_pycolmap("pose_jointly") as pycolmap, tempfile.TemporaryDirectory() as scratch:
-        database = Path(scratch, "database.db")
+    place = tempfile.TemporaryDirectory() if work is None else nullcontext(str(work))
+    with quiet_pycolmap("pose_jointly") as pycolmap, place as scratch:
+        check_pycolmap(pycolmap, caller="pose_jointly")
+        state, database = _State(Path(scratch)), Path(scratch, DATABASE)
         lenses = [names] if how.one_lens else [list(photos) for photos in sweeps.values()]
-        _extract(pycolmap, database, Path(folder), lenses, how, tell)
-        _match(pycolmap, database, names, how, tell)
-        parts = _map(pycolmap, database, Path(folder), Path(scratch, "parts"), len(names), how, tell)
+        if not state.features:
+            for leftover in Path(scratch).glob(f"{DATABASE}*"):
+                leftover.unlink()
+            _extract(pycolmap, database, Path(folder), lenses, how, tell)
+            state.save(features=True)
+        _match(pycolmap, database, names, how, tell, state)
+        if not state.poses:
+            shutil.rmtree(Path(scratch, PARTS), ignore_errors=True)
+            parts = _map(pycolmap, database, Path(folder), Path(scratch, PARTS), len(names), how, tell)
+            state.save(poses=True)
+        else:
+            stored = [path for path in Path(scratch, PARTS).iterdir() if path.name.isdigit()]
+            parts = [pycolmap.Reconstruction(path) for path in sorted(stored, key=lambda path: int(path.name))]
         counts = [_posed(part, sweeps) for part in parts]
         enough = [
             number
@@ -107,7 +135,8 @@ def pose_jointly(
             if all(len(posed[sweep]) >= how.minimum_share * len(photos) for sweep, photos in sweeps.items())
         ]
         if not enough:
-            raise InvalidArgument(_complaint(counts, sweeps, how.minimum_share))
+            kind = NotJoinedError if counts else InvalidArgument
+            raise kind(_complaint(counts, sweeps, how.minimum_share))
         best = max(enough, key=lambda number: sum(map(len, counts[number].values())))
         model, posed = parts[best], counts[best]
         Path(out).mkdir(parents=True, exist_ok=True)
@@ -116,6 +145,36 @@ def pose_jointly(
     found = {name for photos in posed.values() for name in photos}
     unposed = tuple(name for name in names if name not in found)
     return Posing(posed, unposed, float(model.compute_mean_reprojection_error()), int(model.num_points3D()))
+
+
+def check_pycolmap(pycolmap: Any, *, caller: str) -> Any:
+    """The module, if it has what is needed.
+
+    Raises:
+        ImportError: it has not; names its version and what it lacks.
+    """
+    lacking = [name for name in NEEDED if not hasattr(pycolmap, name)]
+    if lacking:
+        raise MissingExtra(
+            f"{caller}: pycolmap {getattr(pycolmap, '__version__', '?')} lacks {', '.join(lacking)}: pip install "
+            "'pycolmap>=4.2'"
+        )
+    return pycolmap
+
+
+class _State:
+    """How far the posing in a folder has come: features, number of matched pairs, poses."""
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / STATE
+        stored = read_json(self._path, caller="pose_jointly") if self._path.is_file() else {}
+        self.features: bool = stored.get("features", False)
+        self.pairs: int = stored.get("pairs", 0)
+        self.poses: bool = stored.get("poses", False)
+
+    def save(self, **changes: Any) -> None:
+        vars(self).update(changes)
+        write_json(self._path, {"features": self.features, "pairs": self.pairs, "poses": self.poses})
 
 
 def _threads(how: PosingSettings) -> int:
@@ -150,7 +209,9 @@ def _extract(
     tell("features", total, total)
 
 
-def _match(pycolmap: Any, database: Path, names: Sequence[str], how: PosingSettings, tell: Progress) -> None:
+def _match(
+    pycolmap: Any, database: Path, names: Sequence[str], how: PosingSettings, tell: Progress, state: _State
+) -> None:
     """Every pair of photos, some hundred at a time."""
     options = pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=_threads(how))
     verification = pycolmap.TwoViewGeometryOptions()
@@ -158,7 +219,7 @@ def _match(pycolmap: Any, database: Path, names: Sequence[str], how: PosingSetti
     chosen = pycolmap.ImportedPairingOptions()
     chosen.match_list_path = database.with_name("pairs.txt")
     pairs = list(combinations(names, 2))
-    for start in range(0, len(pairs), MATCH_AT_ONCE):
+    for start in range(state.pairs, len(pairs), MATCH_AT_ONCE):
         tell("pairs", start, len(pairs))
         lines = (f"{one} {other}\n" for one, other in pairs[start : start + MATCH_AT_ONCE])
         database.with_name("pairs.txt").write_text("".join(lines), encoding="utf-8")
@@ -169,6 +230,7 @@ def _match(pycolmap: Any, database: Path, names: Sequence[str], how: PosingSetti
             verification_options=verification,
             device=pycolmap.Device.cpu,
         )
+        state.save(pairs=start + MATCH_AT_ONCE)
     tell("pairs", len(pairs), len(pairs))
 
 

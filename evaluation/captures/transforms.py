@@ -43,19 +43,38 @@ UNREAD = {  # what instant-ngp and others say of lenses that are not read here
 }
 
 
-def read_object(path: Path) -> dict[str, Any]:
-    """The object in a JSON file.
+def read_object(path: Path, *, caller: str = "load_capture") -> dict[str, Any]:
+    """The object in a JSON file; ``caller`` begins the message of an error.
 
     Raises:
         ValueError: there is no such file, or it is something else.
     """
     try:
-        value = read_json(path, caller="load_capture")
+        value = read_json(path, caller=caller)
     except FileNotFoundError:
-        raise InvalidFile(f"load_capture: {path.parent} has no {path.name}: not a capture") from None
+        raise InvalidFile(f"{caller}: {path.parent} has no {path.name}: not a capture") from None
     if not isinstance(value, dict):
-        raise InvalidFile(f"load_capture: {path} must hold an object, got a {type(value).__name__}")
+        raise InvalidFile(f"{caller}: {path} must hold an object, got a {type(value).__name__}")
     return value
+
+
+def at_size(frame: Mapping[str, Any], stated: tuple[int, int], size: tuple[int, int]) -> dict[str, Any]:
+    """A frame of :func:`read_frames` whose lens is stated for pictures of one size (w, h), for copies of another.
+
+    Example:
+        >>> at_size({"fl_x": 80.0, "cx": 32.0}, (64, 48), (32, 24))
+        {'fl_x': 40.0, 'cx': 16.0, 'w': 32, 'h': 24}
+    """
+    across, down = size[0] / stated[0], size[1] / stated[1]
+    fitted = {**frame, "w": size[0], "h": size[1]}
+    if size == stated:
+        return fitted
+    if "fl_y" not in frame and "fl_x" in frame and across != down:
+        fitted["fl_y"] = frame["fl_x"]
+    for key, factor in (("fl_x", across), ("cx", across), ("fl_y", down), ("cy", down)):
+        if key in fitted:
+            fitted[key] = fitted[key] * factor
+    return fitted
 
 
 def clean_name(name: str) -> str:
@@ -91,6 +110,37 @@ def read_frames(meta: Mapping[str, Any], label: str) -> tuple[list[dict[str, Any
     poses = np.stack([_pose(frame, name) for frame, name in zip(frames, names)])
     shared = {key: value for key, value in meta.items() if key != "frames"}
     return [{**shared, **frame} for frame in frames], names, poses
+
+
+SPLIT_FILES = {sweep: f"transforms_{sweep}.json" for sweep in ("train", "val", "test")}
+
+
+def has_split_files(folder: Path) -> bool:
+    """Whether a folder is laid out as the synthetic NeRF scenes are: a ``transforms_train.json`` or its siblings."""
+    return any((folder / file).is_file() for file in SPLIT_FILES.values())
+
+
+def read_split_files(folder: Path) -> dict[str, Any]:
+    """``transforms_train.json``, ``_val`` and ``_test`` of the synthetic NeRF scenes as one ``transforms.json``.
+
+    Each file is a sweep, and what it states for all of its frames stands with each of them. A photo in two files with
+    one pose is one frame.
+
+    Raises:
+        ValueError: what is wrong with a file; a photo in two files with two poses.
+    """
+    frames: dict[str, dict[str, Any]] = {}
+    lists: dict[str, list[str]] = {}
+    for sweep, file in SPLIT_FILES.items():
+        if not (folder / file).is_file():
+            continue
+        merged, names, _ = read_frames(read_object(folder / file), f"{file} in {folder}")
+        for frame, name in zip(merged, names):
+            if name in frames and frames[name]["transform_matrix"] != frame["transform_matrix"]:
+                raise InvalidFile(f"load_capture: {name!r} stands in two files of {folder} with two poses")
+            frames[name] = frame
+        lists[f"{sweep}_filenames"] = list(names)
+    return {**lists, "frames": list(frames.values())}
 
 
 def _frame_name(frame: Any, number: int) -> str:
@@ -193,7 +243,13 @@ def _distortion(frame: Mapping[str, Any], name: str) -> list[Any]:
 
 
 def write_transforms(
-    path: str | Path, cameras: Cameras, names: Sequence[str], lists: Mapping[str, Sequence[str]], **extra: Any
+    path: str | Path,
+    cameras: Cameras,
+    names: Sequence[str],
+    lists: Mapping[str, Sequence[str]],
+    frame_keys: Sequence[Mapping[str, Any]] | None = None,
+    /,
+    **extra: Any,
 ) -> None:
     """Write the file that stock nerfstudio (1.1.5) reads, whole or not at all.
 
@@ -205,6 +261,7 @@ def write_transforms(
         cameras: in the world and at the size of the stored photos.
         names: of the photos, relative to the file's folder.
         lists: ``train_filenames`` and so on; nerfstudio wants train, val and test, or none of them.
+        frame_keys: per photo, further keys of its frame.
         **extra: further keys of the file.
 
     Raises:
@@ -219,8 +276,10 @@ def write_transforms(
     lenses = np.concatenate([cameras.intrinsics, cameras.distortion], axis=1)
     alike = bool((lenses == lenses[:1]).all())
     frames: list[dict[str, Any]] = []
-    for name, pose, lens, size in zip(names, cameras.camera_to_world, lenses, cameras.sizes.tolist(), strict=True):
-        own = {} if cameras.same_size else dict(zip("wh", size))
+    more = [{}] * len(names) if frame_keys is None else frame_keys
+    rows = zip(names, cameras.camera_to_world, lenses, cameras.sizes.tolist(), more, strict=True)
+    for name, pose, lens, size, further in rows:
+        own = {**further, **({} if cameras.same_size else dict(zip("wh", size)))}
         own |= {} if alike else dict(zip(keys, lens.tolist()))
         frames.append({"file_path": name, **own, "transform_matrix": [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]]})
     shared = dict(zip(keys, lenses[0].tolist())) if alike else {}

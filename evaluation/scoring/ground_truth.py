@@ -14,6 +14,7 @@ from ...core.errors import InvalidArgument, InvalidFile
 from ..captures.colmap import find_model
 from ..captures.loading import load_capture
 from ..captures.splits import EVAL_NAMES, TRAIN_NAMES, choose_split
+from ..captures.transforms import has_split_files
 from .conventions import SceneExtent
 from .pseudo_truth import PseudoTruth, check_cameras, load_pseudo_truth
 from .renders import match_names, read_masks, read_sized_photos
@@ -80,7 +81,8 @@ def read_ground_truth(
     """
     stored = None if masks is None or masks.is_dir() else load_pseudo_truth(masks)
     views = None if stored is None else stored.names
-    if eval_split is not None or (folder / "transforms.json").is_file() or find_model(folder) is not None:
+    described = (folder / "transforms.json").is_file() or has_split_files(folder)
+    if eval_split is not None or described or find_model(folder) is not None:
         found = _read_capture(folder, views, downscale, eval_split, train_split, normalize)
     else:
         found = _Photos(*read_sized_photos(folder, views, downscale=downscale))

@@ -14,6 +14,7 @@ all of them, by their file names alone. Whatever does not match is reported toge
 from __future__ import annotations
 
 import gzip
+import warnings
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
@@ -24,13 +25,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.errors import InvalidArgument, InvalidFile, MissingExtra, MissingFile
+from ...core.errors import InvalidArgument, InvalidFile, MissingFile
+from ..captures.photos import PHOTO_ENDINGS, check_heic, exif_orientation, flatten, is_photo, pillow, warn_of_unread
 from ..metrics.checks import Mask
 from .views import Renders, pad_views
 
 Shape = tuple[int, int]  # height and width
 
-PICTURES = (".png", ".jpg", ".jpeg")
+PICTURES = PHOTO_ENDINGS
 EIGHT_BITS = ("RGB", "L", "P", "RGBA", "LA", "PA", "1")
 KNOBS = ("confidence", "uncertainty")
 MAPS = ("depth", "accumulation", "normals", *KNOBS)
@@ -96,7 +98,9 @@ def read_photos(
     """Photos of a folder, in the order of their names or of ``views``.
 
     Args:
-        folder: PNG or JPEG, in folders below it too.
+        folder: PNG, JPEG, HEIC and others, in folders below it too; dot files are left out. Transparent pixels stand
+            before white. Photos are read as they are stored, whatever their EXIF tags say of turning, as COLMAP and
+            nerfstudio read them; a warning counts those that have such a tag.
         views: only these; None: all there are.
         downscale: stored pixels to one of the result, along each axis, >= 1; the size is rounded to whole pixels.
 
@@ -133,10 +137,17 @@ def read_sized_photos(
     names = tuple(found) if views is None else tuple(views)
     keys = names if views is None else match_names("photos", list(found), names, where=str(source), whole=False)
     paths = [found[key] for key in keys]
+    turned = sum(_turned(path) for path in paths)
+    if turned:
+        warnings.warn(
+            f"read_photos: the EXIF tags of {turned} photos in {source} turn them; they are read as they are stored, "
+            "as COLMAP and nerfstudio read them",
+            stacklevel=2,
+        )
     stored = [_size(path) for path in paths]
     shapes = [(max(1, round(height / downscale)), max(1, round(width / downscale))) for width, height in stored]
     sizes = np.array([shape[::-1] for shape in shapes], dtype=np.int64)
-    return names, _stack(paths, shapes, resize=True), sizes
+    return names, _stack(paths, shapes, resize=True, background=1.0), sizes
 
 
 def read_masks(folder: str | Path, views: Sequence[str], shape: Shape | Sequence[Shape]) -> Mask:
@@ -249,9 +260,13 @@ def _pictures(folder: Path, skip: Sequence[str] = ()) -> dict[str, Path]:
     if not folder.is_dir():
         raise MissingFile(f"no folder {folder}")
     found: dict[str, Path] = {}
-    for path in sorted(folder.rglob("*")):
-        inner = path.relative_to(folder)
-        if path.suffix.lower() not in PICTURES or inner.parts[0] in skip or not path.is_file():
+    files = [path for path in sorted(folder.rglob("*")) if path.is_file()]
+    inside = {path: path.relative_to(folder) for path in files}
+    files = [path for path in files if inside[path].parts[0] not in skip]
+    warn_of_unread(files, caller="evaluate")
+    for path in files:
+        inner = inside[path]
+        if not is_photo(path):
             continue
         name = inner.with_suffix("").as_posix()
         if name in found:
@@ -259,6 +274,7 @@ def _pictures(folder: Path, skip: Sequence[str] = ()) -> dict[str, Path]:
         found[name] = path
     if not found:
         raise InvalidFile(f"{folder} holds no pictures ({', '.join(PICTURES)})")
+    check_heic(found.values(), caller="evaluate")
     return found
 
 
@@ -308,6 +324,15 @@ def _times(size: tuple[int, int]) -> str:
     return f"{size[0]} x {size[1]}"
 
 
+def _turned(path: Path) -> bool:
+    image = _pillow()
+    try:
+        with image.open(path) as picture:
+            return exif_orientation(picture) != 1
+    except (OSError, SyntaxError, image.DecompressionBombError) as error:
+        raise InvalidFile(f"cannot read {path} ({error})") from None
+
+
 def _size(path: Path) -> tuple[int, int]:
     image = _pillow()
     try:
@@ -317,7 +342,13 @@ def _size(path: Path) -> tuple[int, int]:
         raise InvalidFile(f"cannot read {path} ({error})") from None
 
 
-def _stack(paths: Sequence[Path], shape: Shape | Sequence[Shape], *, resize: bool = False) -> NDArray[np.float32]:
+def _stack(
+    paths: Sequence[Path],
+    shape: Shape | Sequence[Shape],
+    *,
+    resize: bool = False,
+    background: float | None = None,
+) -> NDArray[np.float32]:
     """``(n, H, W, 3)`` float32 in [0, 1]; pictures of another size are refused together unless resized."""
     shapes = _shapes(shape, len(paths))
     sizes = [(width, height) for height, width in shapes]
@@ -330,18 +361,16 @@ def _stack(paths: Sequence[Path], shape: Shape | Sequence[Shape], *, resize: boo
             f"{len(other)} of {len(paths)} pictures in {other[0][0].parent} are not {_times(wanted)} as the photos "
             f"are: {_listed(f'{path.name} is {_times(size)}' for path, size, _ in other)}{hint}"
         )
-    return pad_views([_read(path, size) for path, size in zip(paths, sizes)], _canvas(shapes), 0.0)
+    return pad_views([_read(path, size, background) for path, size in zip(paths, sizes)], _canvas(shapes), 0.0)
 
 
-def _read(path: Path, size: tuple[int, int]) -> NDArray[np.float32]:
+def _read(path: Path, size: tuple[int, int], background: float | None) -> NDArray[np.float32]:
     image = _pillow()
     try:
         with image.open(path) as picture:
             if picture.mode not in EIGHT_BITS:
                 raise InvalidFile(f"{path} has pixels of kind {picture.mode}, not 8-bit colours")
-            if picture.mode in ("RGBA", "LA", "PA") and picture.getchannel("A").getextrema()[0] < 255:
-                raise InvalidFile(f"{path} has transparent pixels; put it on a background first")
-            plain = picture.convert("RGB")
+            plain = flatten(picture, path, background)
             small = plain if plain.size == size else plain.resize(size, image.Resampling.BOX)
             return np.asarray(small, dtype=np.float32) / np.float32(255)
     except (OSError, image.DecompressionBombError) as error:
@@ -349,8 +378,4 @@ def _read(path: Path, size: tuple[int, int]) -> NDArray[np.float32]:
 
 
 def _pillow() -> Any:
-    try:
-        from PIL import Image
-    except ImportError as error:
-        raise MissingExtra("reading pictures needs Pillow: pip install unghost[eval]") from error
-    return Image
+    return pillow(caller="evaluate")

@@ -5,7 +5,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from unghost.core.cameras import Cameras, distort, largest_radius, look_at, undistort, warn_if_turned_away
+from unghost.core.cameras import (
+    Cameras,
+    distort,
+    largest_radius,
+    look_at,
+    undistort,
+    warn_if_elsewhere,
+    warn_if_turned_away,
+)
 from unghost.core.frames import random_rotations
 
 PHONE = np.array([0.05, -0.08, 0.01, 0.002, 0.0006, -0.0004])
@@ -132,3 +140,21 @@ def test_opencv_poses_are_noticed_and_others_are_not():
         warn_if_turned_away(wrong, box + 100.0, caller="me")  # a box that nobody looks at, however turned
     with pytest.warns(UserWarning, match=r"me: the cameras have 0.0% of the aabb in view.*OpenCV"):
         warn_if_turned_away(wrong, box, caller="me")
+
+
+def test_cameras_of_another_world_are_noticed_and_others_are_not():
+    box = np.array([[-0.6] * 3, [0.6] * 3])
+    right, wrong = inward()
+    outward = Cameras.create(look_at(np.zeros((8, 3)) + 0.01, right.origins[:8]), right.intrinsics[0], 80, 60)
+    some = Cameras.create(right.camera_to_world, right.intrinsics, 80, 60)
+    corner = np.array([[0.4, 0.4, 0.4], [0.6, 0.6, 0.6]])  # a small part of what they see
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for rig in (right, outward, None, right.select(slice(0, 0)), wrong):  # of the last, the other check speaks
+            warn_if_elsewhere(rig, box, caller="me")
+        warn_if_elsewhere(some, corner, caller="me")
+    far = Cameras.create(right.camera_to_world * np.array([1, 1, 1, 60.0]), right.intrinsics, 80, 60)
+    with pytest.warns(UserWarning, match=r"me: the cameras do not fit .* 5\d\.\d of its diagonals away.*dataparser"):
+        warn_if_elsewhere(far, box, caller="me")
+    with pytest.warns(UserWarning, match=r"together they have 0% of its aabb in view"):
+        warn_if_elsewhere(right, box + np.array([0, 0, 8.0]), caller="me")

@@ -169,3 +169,9 @@ def test_a_new_folder_has_the_usual_permissions(tmp_path, unique):
     with new_folder(tmp_path / "new", unique=unique):
         pass
     assert pathlib.Path(tmp_path, "new").stat().st_mode == pathlib.Path(tmp_path, "usual").stat().st_mode
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_json_with_a_byte_order_mark_is_read(tmp_path, encoding):
+    (tmp_path / "a.json").write_bytes('{"ä": 1}'.encode(encoding))
+    assert read_json(tmp_path / "a.json", caller="test") == {"ä": 1}

@@ -480,6 +480,7 @@ def inside_out():
     return Cameras.create(poses, np.array([50.0, 50.0, 32.0, 32.0]), 64, 64)
 
 
+@pytest.mark.filterwarnings("ignore:clean. cameras are not used")  # by this denoiser
 def test_cameras_inside_out_are_pointed_out_by_both(kit, aabb):
     with pytest.warns(UserWarning, match=r"DensityRegularizer: .*OpenCV"):
         build(kit, aabb, kit.identity, cameras=inside_out())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -30,7 +31,8 @@ def capture(
     """Make a capture from two videos (or two folders of photos): one to train on, one to be scored on.
 
     The sharpest frames are kept, both sweeps are posed together by COLMAP (on the CPU; 2 x 100 frames take half an
-    hour or more on two cores), and the folder can be read by unghost and by stock nerfstudio.
+    hour or more on two cores), and the folder can be read by unghost and by stock nerfstudio. After a crash or Ctrl-C
+    the same call goes on from what was computed, which is beside OUT.
 
     Args:
         train: video or folder of photos to train on.
@@ -49,7 +51,11 @@ def capture(
         def progress(stage: str, done: int, total: int) -> None:
             bars(done, total, stage=stage, unit="pair" if stage == "pairs" else "photo")
 
-        told = make_capture(train, evaluation, out, frames=frames, settings=settings, progress=progress)
+        try:
+            told = make_capture(train, evaluation, out, frames=frames, settings=settings, progress=progress)
+        except KeyboardInterrupt:
+            print(f"what was computed is kept beside {out}: the same call goes on from there", file=sys.stderr)
+            raise
     for sweep in ("train", "eval"):
         each = told[sweep]
         print(f"{sweep}: {each['seen']} pictures in {each['source']}, {each['kept']} kept, {each['posed']} posed")
@@ -75,8 +81,9 @@ def convert(
 ) -> None:
     """Say how hard a capture's evaluation is and, with --out, write it as stock nerfstudio reads it.
 
-    Reads transforms.json folders (the released Nerfbusters captures with their frame_1_... names too) and COLMAP
-    models. Writes photos, poses, and the train, val and test lists that override nerfstudio's --eval-mode.
+    Reads transforms.json folders (the released Nerfbusters captures with their frame_1_... names too),
+    transforms_train.json and its siblings, and COLMAP models. Writes photos, poses, and the train, val and test lists
+    that override nerfstudio's --eval-mode; masks, depths and points that transforms.json names go along.
 
     Args:
         capture: folder with transforms.json, or with a COLMAP model in sparse/0 and photos in images.
@@ -85,7 +92,7 @@ def convert(
         eval_split: the sweep to be scored on: "eval", else "test" or "val", unless told otherwise.
         every: in place of eval_split: hold out every so many-th photo of train_split (8 is what most papers do).
         splits: JSON file of sweeps, {"name": ["images/a.jpg", ...], ...}, in place of what the capture says.
-        photos: folder that holds the photos, if they are not where the capture says.
+        photos: folder that holds the photos, if they are not where the capture says; smaller copies will do.
         missing: "drop" leaves photos out that are not there, and counts them.
         link: symbolic links to the photos instead of copies.
         plot: PNG for a bird's-eye view of both sweeps.
@@ -98,6 +105,8 @@ def convert(
         _check_plot(plot, "convert")
     if every is not None and eval_split is not None:
         raise InvalidArgument("convert: --every takes its photos from the training sweep: leave --eval-split out")
+    if every is not None and every < 2:
+        raise InvalidArgument(f"convert: --every must be >= 2, got {every}")
     posed, told = _read(capture, splits, missing, photos)
     print("\n".join(told), end="\n" if told else "")
     if every is None:
@@ -112,7 +121,10 @@ def convert(
         print(f"{len(train) + len(evaluation) - both} photos are in both sweeps: they were trained on")
     _report(posed, train, evaluation, plot, held_out=every)
     if out is not None:
-        write_nerfstudio(posed, out, train=train, evaluation=evaluation, photos="link" if link else "copy")
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            write_nerfstudio(posed, out, train=train, evaluation=evaluation, photos="link" if link else "copy")
+        print("".join(f"{each.message}\n" for each in caught), end="")
         print(f"{out}: ns-train nerfacto --data {out}")
 
 

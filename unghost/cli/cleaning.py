@@ -63,9 +63,10 @@ def clean(
         mask: a keep mask of an earlier cleaning, applied as it is instead of judging anew.
         keep_box: x0 y0 z0 x1 y1 z1, scene units: nothing in this box is removed; may be given several times. With
             --mask, takes back what that removed there (the boxes of the preview's table, say).
-        cameras: a transforms.json (nerfstudio's format) of the training photos, in the file's own world; where few
-            or none of them look, ghosts are likelier. For --denoiser views; the others do not use them. The photos
-            themselves are not needed.
+        cameras: of the training photos, in the file's own world: transforms.json (nerfstudio's), cameras.json
+            (Inria's) or a COLMAP model; where few or none of them look, ghosts are likelier. For --denoiser views; the
+            others do not use them. The photos are not needed. A dataparser_transforms.json (nerfstudio's) beside
+            either file is applied.
         denoiser: a shipped name or an .onnx file.
         strength: 0 removes nothing, 0.5 what the denoiser advises, 1 everything.
         resolution: of splats, cells along the longest side of the box; by the splats' sizes if not given.
@@ -107,7 +108,7 @@ def clean(
                 raise InvalidArgument(f"clean: --mask repeats a cleaning as it was; leave out {', '.join(unused)}")
             how["mask"] = KeepMask.load(mask).restored(boxes)
         else:
-            how |= {"keep_boxes": tuple(boxes), **_judging(denoiser, threads, strength, cameras)}
+            how |= {"keep_boxes": tuple(boxes), **_judging(denoiser, threads, strength, cameras, source)}
             how |= {"settings": CleanSettings(**settings)} if settings else {}
         found, density_fn = (_clean_splats if splats else _clean_grid)(source, target, **how)
     if preview:
@@ -126,7 +127,7 @@ def clean(
     print(f"cleaned: {target}" + (f"\nkeep mask: {keep}" if keep else ""))
 
 
-def _judging(denoiser: str, threads: int, strength: float, cameras: Path | None) -> dict[str, Any]:
+def _judging(denoiser: str, threads: int, strength: float, cameras: Path | None, source: Path) -> dict[str, Any]:
     """What ``clean`` is given to judge with."""
     from ..denoisers import load_denoiser
     from ..evaluation.captures.loading import load_cameras
@@ -134,7 +135,7 @@ def _judging(denoiser: str, threads: int, strength: float, cameras: Path | None)
     return {
         "denoiser": load_denoiser(denoiser, backend="onnx", threads=threads or None),
         "strength": strength,
-        "cameras": None if cameras is None else load_cameras(cameras),
+        "cameras": None if cameras is None else load_cameras(cameras, scene=source),
         "progress": StagedProgress("cube"),
     }
 

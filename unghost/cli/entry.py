@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import NoReturn
 
 from ..core.errors import UnghostError
+from .options import in_options, option_names
 
 USER_ERRORS = (UnghostError, OSError)  # what the user can mend; anything else is a bug of ours
 USAGE_EXIT, INTERRUPTED_EXIT = 2, 130
@@ -87,7 +88,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if len(words) < len(given):
             raise
         message = " ".join(str(error).split()).removeprefix(f"{verb}: ") or type(error).__name__
-        print(f"unghost {verb}: {message}", file=sys.stderr)
+        print(f"unghost {verb}: {in_options(message, _options_of(verb))}", file=sys.stderr)
         return USAGE_EXIT
     except KeyboardInterrupt:
         print(f"unghost {verb}: interrupted", file=sys.stderr)
@@ -102,6 +103,12 @@ def _run(verb: str, words: Sequence[str]) -> int | None:
     module = importlib.import_module(f".{VERBS[verb][0]}", __package__)
     function: Callable[..., int | None] = getattr(module, verb)
     return tyro.cli(function, prog=f"unghost {verb}", args=words)
+
+
+def _options_of(verb: str) -> set[str]:
+    """The names of a verb's options, which is imported already: it has raised an error."""
+    module = sys.modules.get(f"{__package__}.{VERBS[verb][0]}") if verb else None
+    return set() if module is None else option_names(getattr(module, verb))
 
 
 def _overview(words: Sequence[str]) -> NoReturn:

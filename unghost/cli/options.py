@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 from tyro.conf import arg
@@ -71,3 +72,67 @@ def _metavar(hint: Any) -> str:
     if parts and all(isinstance(part, str) for part in parts):  # a Literal
         return "{" + ",".join(parts) + "}"
     return "|".join(map(_metavar, parts)) if parts else str(hint)
+
+
+ALIASES = {"minimum_views": "min_views", "keep_boxes": "keep_box"}  # arguments that a verb offers by another name
+
+
+def option_names(verb: Callable[..., Any]) -> set[str]:
+    """The options of a verb by their names in Python: its parameters that are not positional, and their fields.
+
+    Example:
+        >>> def verb(source: Positional[str], min_views: int = 1) -> None: ...
+        >>> option_names(verb)
+        {'min_views'}
+    """
+    names: set[str] = set()
+    for name, parameter in inspect.signature(verb).parameters.items():
+        if dataclasses.is_dataclass(parameter.default):
+            names |= {item.name for item in dataclasses.fields(parameter.default)}
+        elif not str(parameter.annotation).startswith("Positional"):
+            names.add(name)
+    return names
+
+
+def in_options(message: str, names: Collection[str]) -> str:
+    """An error message of the library with its arguments written as the options of a verb.
+
+    Rewritten are ``name='value'``, "see name", "name must be", and every name of two words or more. A hint in brackets
+    that begins with ``name='value'`` goes where the verb has no such option.
+
+    Args:
+        message: one line.
+        names: of options, as :func:`option_names` gives them.
+
+    Example:
+        >>> in_options("3 photos are gone (missing='drop' leaves them out)", {"missing"})
+        '3 photos are gone (--missing drop leaves them out)'
+        >>> in_options("load: downscale must be >= 1 for the best downscale", {"downscale"})
+        'load: --downscale must be >= 1 for the best downscale'
+    """
+    message = re.sub(
+        r" \(([a-z_]+)='[^']*'[^()]*\)", lambda each: each[0] if each[1] in (*names, *ALIASES) else "", message
+    )
+    typed = {name: name for name in names} | {name: to for name, to in ALIASES.items() if to in names}
+    if not typed:
+        return message
+    listed = "|".join(sorted(map(re.escape, typed), key=len, reverse=True))
+    before, after = r"(?<![\w.\-/'\"])", r"(?![\w\-/'\"]|\.\w)"
+
+    def option(name: str) -> str:
+        return "--" + typed[name].replace("_", "-")
+
+    def assigned(match: re.Match[str]) -> str:
+        name, value = match[1], match[2].strip("'\"")
+        if value in ("True", "False"):
+            return option(name) if value == "True" else option(name).replace("--", "--no-", 1)
+        return f"{option(name)} {value}"
+
+    def ruled(match: re.Match[str]) -> str:
+        return re.sub(f"{before}({listed}){after}", lambda each: option(each[1]), match[0])
+
+    message = re.sub(f"{before}({listed})=('[^']*'|\"[^\"]*\"|[\\w.+-]+)", assigned, message)
+    message = re.sub(r"(?:^|(?<=: ))[\w, ]*?(?= (?:must (?:be|lie|name|end)|names no|needs)\b)", ruled, message)
+    message = re.sub(rf"(?<=\bsee )({listed}){after}", lambda each: option(each[1]), message)
+    long = "|".join(sorted((re.escape(name) for name in typed if "_" in name), key=len, reverse=True))
+    return re.sub(f"{before}({long}){after}", lambda each: option(each[1]), message) if long else message

@@ -253,3 +253,46 @@ def test_without_pycolmap_the_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     with pytest.raises(ImportError, match=r"pip install unghost\[capture\]"):
         load_capture(folder)
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_names_with_spaces_run_to_the_end_of_the_line(tmp_path, text):
+    names = ["A-DJI_V_map (1).png", "A-DJI_V_map (2).png", "walk 1/a  b.png"]
+    folder = _write(tmp_path / "c", model_of([(name, "PINHOLE") for name in names]), text=text)
+    capture = load_capture(folder, downscale=1, normalize=False)
+    assert capture.names == tuple(f"images/{name}" for name in names)
+    binary = load_capture(_write(tmp_path / "d", model_of([(name, "PINHOLE") for name in names])), normalize=False)
+    np.testing.assert_allclose(capture.cameras.camera_to_world, binary.cameras.camera_to_world, atol=1e-12)
+
+
+def test_text_models_of_other_programs_are_read(tmp_path):
+    """RealityScan's exponents of three digits and line ends, a byte order mark, comments between, points or none."""
+    folder = _write(tmp_path / "c", model_of([("a b.png", "PINHOLE"), ("c.png", "PINHOLE")]), text=True)
+    wanted = load_capture(folder, normalize=False)
+    file = folder / "sparse" / "0" / "images.txt"
+    photos = [line.split(None, 9) for line in file.read_text().splitlines() if line.rstrip().endswith(".png")]
+    lines = ["# made elsewhere", ""]
+    for number, (key, *values, camera, name) in enumerate(photos):
+        numbers = [f"{float(value):.15e}".replace("e-0", "e-00").replace("e+0", "e+00") for value in values]
+        lines += [" ".join([key, *numbers, camera, name]), "1.5 2.5 -1" if number else "", "# between"]
+    file.write_bytes(("\ufeff" + "\r\n".join(lines)).encode())
+    found = load_capture(folder, normalize=False)
+    assert found.names == wanted.names == ("images/a b.png", "images/c.png")
+    np.testing.assert_allclose(found.cameras.camera_to_world, wanted.cameras.camera_to_world, atol=1e-12)
+    file.write_text("1 1 0 0 0 0 0 0 1\n\n")
+    with pytest.raises(ValueError, match=r"images\.txt has a line that is no photo: '1 1 0 0 0 0 0 0 1'"):
+        load_capture(folder)
+
+
+def test_smaller_copies_of_a_model_s_photos_will_do(tmp_path):
+    """The layout of mip-NeRF 360 with images_4 alone: the cameras are those of the full size."""
+    folder = _write(tmp_path / "c", model_of([("a.JPG", "PINHOLE"), ("b.JPG", "PINHOLE")]))
+    whole = load_capture(folder, downscale=1, normalize=False)
+    shutil.rmtree(folder / "images")
+    for name in "ab":
+        (folder / "images_4").mkdir(exist_ok=True)
+        Image.new("RGB", (WIDTH // 4, HEIGHT // 4)).save(folder / "images_4" / f"{name}.JPG")
+    for options in ({}, {"photos": folder / "images_4"}):
+        found = load_capture(folder, downscale=1, normalize=False, **options)
+        np.testing.assert_allclose(found.cameras.intrinsics, whole.cameras.intrinsics / 4)
+        assert found.names == whole.names

@@ -78,8 +78,14 @@ def test_cameras_need_no_photos_and_are_those_of_the_capture(tmp_path):
 )
 def test_cameras_that_a_file_does_not_tell(meta, drop, message, tmp_path):
     folder = _write(tmp_path / "c", meta=meta, drop=drop)
+    shutil.rmtree(folder / "images")
     with pytest.raises(ValueError, match=message):
         load_cameras(folder)
+
+
+def test_a_size_that_a_file_does_not_state_is_that_of_the_photos(tmp_path):
+    cameras = load_cameras(_write(tmp_path / "c", drop=("w", "h")))
+    assert (cameras.width, cameras.height) == (16, 12)
 
 
 def test_cameras_of_two_sizes_have_each_their_own(tmp_path):
@@ -368,17 +374,24 @@ def test_a_broken_photo_is_named(tmp_path):
         load_capture(tmp_path / "c")
 
 
-def test_transparent_pixels_are_refused_and_opaque_alpha_is_not(tmp_path):
+def test_transparent_pixels_stand_before_white_or_the_stated_background(tmp_path):
     _write(tmp_path / "c")
     photo = tmp_path / "c" / "images" / "0.png"
-    opaque = Image.open(photo).convert("RGBA")
-    opaque.save(photo)
-    before = load_capture(tmp_path / "c").images([0])
-    assert before.shape[-1] == 3
-    opaque.putpixel((0, 0), (0, 0, 0, 10))
-    opaque.save(photo)
-    with pytest.raises(ValueError, match="transparent"):
-        load_capture(tmp_path / "c").images([0])
+    plain = load_capture(tmp_path / "c", downscale=1).images([0])
+    alpha = Image.open(photo).convert("RGBA")
+    alpha.save(photo)
+    np.testing.assert_array_equal(load_capture(tmp_path / "c", downscale=1).images([0]), plain)
+    alpha.putpixel((0, 0), (255, 0, 51, 102))  # 0.4 opaque
+    alpha.save(photo)
+    white = load_capture(tmp_path / "c", downscale=1).images([0])
+    np.testing.assert_allclose(white[0, 0, 0], [1.0, 0.6, 0.6 + 0.4 * 0.2], atol=1 / 255)
+    np.testing.assert_array_equal(white[0, 1:], plain[0, 1:])
+    black = load_capture(tmp_path / "c", downscale=1, background=0.0).images([0])
+    np.testing.assert_allclose(black[0, 0, 0], [0.4, 0.0, 0.08], atol=1 / 255)
+    with pytest.raises(ValueError, match=r"0\.png has transparent pixels"):
+        load_capture(tmp_path / "c", background=None).images([0])
+    with pytest.raises(ValueError, match=r"background must be in \[0, 1\] or None, got 255"):
+        load_capture(tmp_path / "c", background=255)
 
 
 def test_unknown_split_lists_the_choices(tmp_path):

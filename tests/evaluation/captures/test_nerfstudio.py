@@ -176,3 +176,55 @@ def test_sizes_that_differ_stand_with_each_frame(tmp_path):
     again = whole(tmp_path / "out")
     np.testing.assert_array_equal(again.cameras.sizes, cameras.sizes)
     np.testing.assert_array_equal(again.cameras.intrinsics, cameras.intrinsics)
+
+
+@pytest.mark.parametrize("photos", ["copy", "link"])
+def test_masks_depths_points_and_further_keys_go_along(tmp_path, photos):
+    folder = released(tmp_path / "in")
+    meta = json.loads((folder / "transforms.json").read_text())
+    applied = np.eye(4)[:3].tolist()
+    meta |= {"applied_transform": applied, "applied_scale": 2.0, "ply_file_path": "sparse/pc.ply", "cameras": 1}
+    meta |= {"camera_angle_x": 0.7, "train_filenames": [NAMES[0]]}
+    for number, frame in enumerate(meta["frames"]):
+        frame |= {"mask_path": f"./masks/{number}.png", "colmap_im_id": number, "depth_file_path": f"d{number}/x.npy"}
+        for key in ("mask_path", "depth_file_path"):
+            (folder / frame[key]).parent.mkdir(exist_ok=True)
+            (folder / frame[key]).write_text(f"{key} of {number}")
+    (folder / "sparse").mkdir()
+    (folder / "sparse" / "pc.ply").write_text("points")
+    (folder / "transforms.json").write_text(json.dumps(meta))
+    out = tmp_path / "out"
+    write_nerfstudio(whole(folder), out, train=[0, 2], evaluation=[3], photos=photos)
+    written = json.loads((out / "transforms.json").read_text())
+    assert (written["applied_transform"], written["applied_scale"], written["cameras"]) == (applied, 2.0, 1)
+    assert (out / written["ply_file_path"]).read_text() == "points"
+    assert "camera_angle_x" not in written
+    assert written["train_filenames"] == [NAMES[0], NAMES[2]]
+    assert [frame["colmap_im_id"] for frame in written["frames"]] == [0, 2, 3]
+    for frame in written["frames"]:
+        for key in ("mask_path", "depth_file_path"):
+            assert (out / frame[key]).read_text() == f"{key} of {frame['colmap_im_id']}"
+            assert (out / frame[key]).is_symlink() == (photos == "link")
+    assert written["frames"][0]["mask_path"] == "masks/0.png"  # nerfstudio looks for masks_2/0.png, too
+    assert len({frame["depth_file_path"] for frame in written["frames"]}) == 3
+    again = tmp_path / "again"
+    write_nerfstudio(whole(out), again, train=[0, 1], evaluation=[2])
+    assert json.loads((again / "transforms.json").read_text()) == written
+
+
+def test_what_leads_to_no_file_is_said_to_be_lost(tmp_path, recwarn):
+    folder = released(tmp_path / "in")
+    meta = json.loads((folder / "transforms.json").read_text())
+    meta["ply_file_path"] = "gone.ply"
+    for number, frame in enumerate(meta["frames"]):
+        frame["mask_path"] = f"masks/{number}.png"
+    (folder / "masks").mkdir()
+    (folder / "masks" / "2.png").write_text("mask")
+    (folder / "transforms.json").write_text(json.dumps(meta))
+    write_nerfstudio(whole(folder), tmp_path / "out", train=[0, 2], evaluation=[3])
+    said = [str(each.message) for each in recwarn]
+    assert any("mask_path leads to no file in 2 of 3 frames and is left out there" in each for each in said)
+    assert any("ply_file_path leads to no file in 1 of 1" in each for each in said)
+    written = json.loads((tmp_path / "out" / "transforms.json").read_text())
+    assert ["mask_path" in frame for frame in written["frames"]] == [False, True, False]
+    assert "ply_file_path" not in written

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from unghost.evaluation.captures import posing as posing_module
 from unghost.evaluation.captures.colmap import read_model
 from unghost.evaluation.captures.loading import load_capture
 from unghost.evaluation.captures.posing import PosingSettings, pose_jointly
@@ -141,3 +142,28 @@ def test_two_dozen_photos_of_a_real_capture_get_the_poses_that_it_came_with(room
     assert np.median(distance) < 0.01  # of the capture's extent; 0.0028 reached
     assert np.median(angle) < 1  # 0.42 reached
     assert angle.max() < 2
+
+
+@pytest.mark.slow
+def test_what_was_killed_goes_on_to_the_same_poses(posed, tmp_path, monkeypatch):
+    folder, sweeps, _, posing, _ = posed
+    arguments = {"settings": PosingSettings(threads=1), "work": tmp_path / "work"}
+    (tmp_path / "work").mkdir()
+    monkeypatch.setattr(posing_module, "MATCH_AT_ONCE", 40)
+
+    def killed(stage, done, total):
+        if (stage, done) == ("pairs", 40):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        pose_jointly(folder / "images", sweeps, out=tmp_path / "out", progress=killed, **arguments)
+    steps = []
+    for _ in range(2):  # the second time, from the stored model
+        again = pose_jointly(
+            folder / "images", sweeps, out=tmp_path / "out", progress=lambda *step: steps.append(step), **arguments
+        )
+        assert again.posed == posing.posed
+        assert again.reprojection_error == pytest.approx(posing.reprojection_error, rel=0.05)
+    assert [step for step in steps if step[0] == "pairs" and step[1] == 0] == []
+    assert "features" not in {stage for stage, _, _ in steps}
+    assert steps[-1][0] == "pairs"

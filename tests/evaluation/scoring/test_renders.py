@@ -223,3 +223,33 @@ def test_without_pillow_the_extra_is_named(renders, monkeypatch):
     with pytest.raises(ImportError, match=r"pip install unghost\[eval\]"):
         read_photos(renders)
     assert renders_folder.PICTURES
+
+
+def test_dot_files_are_no_pictures(renders):
+    (renders / "._a.png").write_bytes(b"\x00\x05\x16\x07")  # AppleDouble
+    assert read_photos(renders)[0] == ("a", "b")
+    assert len(read_method("ours", renders, VIEWS, SHAPE).renders.colours) == 2
+
+
+def test_transparent_photos_stand_before_white_and_transparent_renders_are_refused(renders):
+    picture(renders / "a.png", (255, 0, 51, 102), mode="RGBA")  # 0.4 opaque
+    np.testing.assert_allclose(read_photos(renders)[1][0, 0, 0], [1.0, 0.6, 0.68], atol=1 / 255)
+    with pytest.raises(ValueError, match=r"a\.png has transparent pixels"):
+        read_method("ours", renders, VIEWS, SHAPE)
+
+
+def test_photos_that_exif_turns_are_read_as_stored_with_a_warning(renders):
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.new("RGB", (WIDTH, HEIGHT)).save(renders / "a.png", exif=exif)
+    with pytest.warns(UserWarning, match=r"EXIF tags of 1 photos in .* read as they are stored"):
+        _, photos = read_photos(renders)
+    assert photos.shape == (2, HEIGHT, WIDTH, 3)
+
+
+def test_photos_in_further_formats_are_read_and_others_are_counted(tmp_path):
+    for ending in ("tif", "webp", "bmp"):
+        picture(tmp_path / f"{ending}.{ending}", (9, 9, 9))
+    (tmp_path / "raw.dng").write_bytes(b"raw")
+    with pytest.warns(UserWarning, match=r"left out: 1 \.dng"):
+        assert read_photos(tmp_path)[0] == ("bmp", "tif", "webp")

@@ -205,7 +205,7 @@ def test_convert_takes_lists_and_leaves_missing_photos_out(three_sweeps, tmp_pat
         ((), "--train-split must say which sweep is meant; the capture has walk, back, third"),
         (("--train-split", "walk"), "--eval-split must say which sweep is meant"),
         (("--train-split", "walk", "--eval-split", "nope"), "no split 'nope'; choose from walk, back, third, all"),
-        (("--train-split", "walk", "--every", 1), "n >= 2, got 9 and 1"),
+        (("--train-split", "walk", "--every", 1), "--every must be >= 2, got 1"),
         (("--train-split", "walk", "--every", 8, "--eval-split", "back"), "leave --eval-split out"),
         (("--train-split", "third", "--every", 8), "train has no cameras: the measure is not defined"),
         (("--splits", "gone.json"), "has no gone.json"),
@@ -244,3 +244,38 @@ def test_two_folders_of_real_photos_become_a_capture(room, tmp_path, capsys):
     assert np.median(angle) < 1
     assert len(np.unique(found.cameras.intrinsics, axis=0)) == 1
     assert "without a pose, and left out: frame_" in printed
+
+
+def test_convert_names_its_own_options_and_says_what_is_lost(three_sweeps, tmp_path, capsys):
+    (three_sweeps / "03.png").unlink()
+    words = ("convert", three_sweeps, "--train-split", "all", "--every", 4)
+    assert run(*words) == 2
+    assert "(--missing drop leaves them out)" in capsys.readouterr().err
+    meta = json.loads((three_sweeps / "transforms.json").read_text())
+    (three_sweeps / "transforms.json").write_text(json.dumps({**meta, "ply_file_path": "gone.ply"}))
+    assert run(*words, "--missing", "drop", "--out", tmp_path / "out") == 0
+    captured = capsys.readouterr()
+    assert "ply_file_path leads to no file in 1 of 1 file and is left out there" in captured.out
+    assert captured.err == ""
+
+
+def test_capture_names_its_own_options(tmp_path, capsys):
+    for sweep in "ab":
+        (tmp_path / sweep).mkdir()
+    assert run("capture", tmp_path / "a", tmp_path / "b", "--out", tmp_path / "o", "--frames", 0) == 2
+    assert "--frames must be >= 1, got 0" in capsys.readouterr().err
+    assert run("capture", tmp_path / "a", tmp_path / "b", "--out", tmp_path / "o", "--minimum-share", 2) == 2
+    assert "--minimum-share must be in (0, 1], got 2" in capsys.readouterr().err
+
+
+def test_ctrl_c_says_that_nothing_is_lost(tmp_path, capsys, monkeypatch):
+    from unghost.evaluation.captures import creation
+
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(creation, "make_capture", interrupted)
+    assert run("capture", tmp_path, tmp_path, "--out", tmp_path / "out") == 130
+    said = capsys.readouterr().err
+    assert f"kept beside {tmp_path / 'out'}: the same call goes on from there" in said
+    assert said.endswith("unghost capture: interrupted\n")

@@ -8,6 +8,7 @@ import pytest
 
 from unghost import cli
 from unghost.cleaning.keep_mask import KeepMask
+from unghost.cli import cleaning
 from unghost.core.file_kinds import file_kind
 from unghost.fields.adapters.grids import load_grid, save_grid
 
@@ -60,7 +61,7 @@ def test_boxes_are_left_alone_or_taken_back(cleaned, capsys):
     ("words", "message"),
     [
         (["--out", "never.splat"], "grids are written as .npz, got --out never.splat"),
-        (["--keep-box", "1", "0", "0", "0", "1", "1"], "keep_boxes"),
+        (["--keep-box", "1", "0", "0", "0", "1", "1"], "--keep-box"),
         (["--mask", "g-clean.npz"], "is not a keep mask"),
         (["--mask", "g-keep.npz", "--keep", "g-keep.npz"], "mask and keep are the same file"),
         (["--mask", "other.npz"], "clean: the mask's box must be g.npz's"),
@@ -133,3 +134,34 @@ def test_cameras_that_nobody_uses_are_one_line(cleaned, tmp_path, capsys):
         lines = [line for line in re.split(r"[\r\n]", error) if line.startswith("warning: clean: cameras are not used")]
         assert len(lines) == warned
         assert not warned or "--denoiser views" in lines[0]
+
+
+def test_cameras_of_other_tools_are_brought_into_the_world_of_the_file(tmp_path):
+    """Inria's cameras.json; and what nerfstudio's motion, beside the file to be cleaned, makes of it."""
+    entry = {"id": 0, "img_name": "a", "width": 64, "height": 48, "fx": 60.0, "fy": 60.0}
+    entry |= {"position": [1, 2, 3], "rotation": np.eye(3).tolist()}
+    (tmp_path / "model").mkdir()
+    (tmp_path / "model" / "cameras.json").write_text(json.dumps([entry]))
+    (tmp_path / "export").mkdir()
+    words = ("views", 0, 0.5, tmp_path / "model" / "cameras.json", tmp_path / "export" / "splat.ply")
+    assert cleaning._judging(*words)["cameras"].origins.tolist() == [[1, 2, 3]]
+    motion = {"transform": [[1, 0, 0, 10], [0, 1, 0, 0], [0, 0, 1, 0]], "scale": 0.5}
+    (tmp_path / "export" / "dataparser_transforms.json").write_text(json.dumps(motion))
+    assert cleaning._judging(*words)["cameras"].origins.tolist() == [[5.5, 1, 1.5]]
+
+
+def test_cameras_that_do_not_fit_are_warned_of(tmp_path):
+    from unghost import clean
+    from unghost.core.cameras import Cameras, look_at
+    from unghost.denoisers import load_denoiser
+
+    poses = look_at(np.array([[80.0, 0, 0], [0, 80, 0]]), np.zeros((2, 3)))
+    cameras = Cameras.create(poses, [60.0, 60, 32, 24], 64, 48)
+    with pytest.warns(UserWarning, match="clean: the cameras do not fit the scene"):
+        clean(
+            lambda positions: np.zeros(len(positions)),
+            [[-1, -1, -1], [1, 1, 1]],
+            denoiser=load_denoiser("views"),
+            cameras=cameras,
+            resolution=32,
+        )

@@ -142,7 +142,7 @@ def test_without_a_sweep_called_eval_it_is_the_usual_other_name(renders, capture
     assert results(renders / "out")["evaluation"]["views"] == 3
     (capture / "splits.json").write_text(json.dumps({"walk": sweeps["train"], "back": sweeps["eval"]}))
     assert run(renders / "a", "--gt", capture, "--out", renders / "new") == 2
-    assert "eval_split must say which sweep is meant; the capture has walk, back" in capsys.readouterr().err
+    assert "--eval-split must say which sweep is meant; the capture has walk, back" in capsys.readouterr().err
     assert run(renders / "a", "--gt", capture, "--eval-split", "back", "--out", renders / "new") == 0
     assert "No depth limit is known: the capture has no sweep called train" in capsys.readouterr().out
     words = ["--eval-split", "back", "--train-split", "run"]
@@ -217,7 +217,10 @@ def test_two_identical_trajectories_are_scored(renders, capture, capsys):
 def test_options_of_masks_npz_are_refused_without_it(renders, capture, masks, capsys, words):
     option = words[0].removeprefix("--").replace("-", "_")
     assert run(renders / "a", "--gt", capture, "--no-normalize", *words, "--out", renders / "out") == 2
-    assert f"{option} needs masks.npz (of unghost masks) as masks, got no masks" in capsys.readouterr().err
+    assert (
+        f"--{option.replace('_', '-')} needs masks.npz (of unghost masks) as masks, got no masks"
+        in capsys.readouterr().err
+    )
     words = (*words, "--masks", masks)
     assert run(renders / "a", "--gt", capture, "--no-normalize", *words, "--out", renders / "out") == 2
     assert f"got the pictures in {masks}" in capsys.readouterr().err

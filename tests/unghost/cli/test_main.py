@@ -52,7 +52,7 @@ def test_wrong_words_exit_with_two(words, capsys):
         (["clean", "absent.npz"], "unghost clean: no file absent.npz"),
         (["clean", "absent.PLY", "--cameras", "absent"], "unghost clean: no file absent.PLY"),
         (["curate", "absent", "--out", "x"], "unghost curate: load_recipe: absent is neither a file"),
-        (["curate", "procedural", "--out", "x", "--count", "0"], "unghost curate: count must be >= 1, got 0"),
+        (["curate", "procedural", "--out", "x", "--count", "0"], "unghost curate: --count must be >= 1, got 0"),
         (["train", "absent", "--out", "x"], "unghost train: find_shards: absent is not a shard and holds none"),
         (["train", "absent=much", "--out", "x"], "must be FOLDER or FOLDER=WEIGHT"),
         (["demo", "--seed", "-1"], "unghost demo: "),

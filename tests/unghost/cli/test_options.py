@@ -8,7 +8,7 @@ import pytest
 from unghost.cli.captures import PosingOptions, PosingSettings
 from unghost.cli.cleaning import CleanOptions, CleanSettings
 from unghost.cli.entry import VERBS, main
-from unghost.cli.options import given, options_of
+from unghost.cli.options import given, in_options, option_names, options_of
 from unghost.cli.recipes import HarvestConfig, HarvestOptions
 from unghost.cli.training import TrainConfig, TrainOptions
 
@@ -74,3 +74,34 @@ def test_defaults_stand_in_the_help_and_falsy_values_count():
     made = options_of(Config, leave_out=("other",))
     assert "of x, see Thing." in made.__doc__
     assert given(made(share=0.0, name="", sizes=())) == {"share": 0.0, "name": "", "sizes": ()}
+
+
+@pytest.mark.parametrize(
+    ("message", "written"),
+    [
+        ("2 photos are gone (missing='drop' leaves them out)", "2 photos are gone (--missing drop leaves them out)"),
+        ("evaluate: eval_split must say which", "evaluate: --eval-split must say which"),
+        ("see downscale (now 8)", "see --downscale (now 8)"),
+        ("make: downscale and eval_split must be right", "make: --downscale and --eval-split must be right"),
+        ("it holds with normalize=False alone", "it holds with --no-normalize alone"),
+        ("it is with normalize=True", "it is with --normalize"),
+        ("masks: minimum_views must be >= 1", "masks: --min-views must be >= 1"),
+        ("photos must all have one size", "photos must all have one size"),  # no argument, but what it names
+        ("no file out/eval_split, nor 'eval_split'", "no file out/eval_split, nor 'eval_split'"),
+        ("the downscale of eval_split.json", "the downscale of eval_split.json"),
+        ("3 photos are gone (backend='torch' does it); left", "3 photos are gone; left"),  # no option of that name
+        ("say --eval-split or --missing drop", "say --eval-split or --missing drop"),
+    ],
+)
+def test_errors_name_options_as_they_are_typed(message, written):
+    names = {"missing", "eval_split", "downscale", "normalize", "photos", "min_views"}
+    assert in_options(message, names) == written
+
+
+def test_every_verb_has_options_and_a_positional_argument_is_none():
+    from unghost.cli import captures, cleaning
+
+    assert {"out", "frames", "longest_side", "seed"} <= option_names(captures.capture)
+    assert not {"train", "evaluation", "options"} & option_names(captures.capture)
+    assert {"keep_box", "cameras", "strength"} <= option_names(cleaning.clean)
+    assert in_options("nothing must be", set()) == "nothing must be"

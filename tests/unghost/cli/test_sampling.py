@@ -59,9 +59,9 @@ def test_writes_cubes_and_pictures(objective, tmp_path, capsys):
     ("objective", "extra", "message"),
     [
         ("restoration", [], "is of family 'restoration'; only 'diffusion' can be sampled"),
-        ("epsilon", ["--count", "0"], "count and batch_size must be >= 1, got 0"),
+        ("epsilon", ["--count", "0"], "--count and --batch-size must be >= 1, got 0"),
         ("epsilon", ["--steps", "1001"], "steps must lie in [1, 1000], got 1001"),
-        ("epsilon", ["--edge-fraction", "-1"], "edge_fraction must be finite and > 0, got -1.0"),
+        ("epsilon", ["--edge-fraction", "-1"], "--edge-fraction must be finite and > 0, got -1.0"),
         ("bernoulli", ["--eta", "0"], "eta must be 1 for objective 'bernoulli', got 0.0"),
     ],
 )
