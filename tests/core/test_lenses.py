@@ -1,5 +1,6 @@
 """Fisheyes, against OpenCV's formula written out; and cameras that differ in size."""
 
+import dataclasses
 import pickle
 
 import numpy as np
@@ -182,6 +183,13 @@ def test_sizes_of_cameras_that_differ():
     again = pickle.loads(pickle.dumps(views))
     assert (again.sizes == views.sizes).all()
     assert not again.same_size
+    moved = dataclasses.replace(views, camera_to_world=views.camera_to_world[::-1])
+    assert (moved.sizes == views.sizes).all()
+    assert (moved.fisheye == views.fisheye).all()
+    assert (moved.origins == views.origins[::-1]).all()
+    assert dataclasses.replace(views, width=7, height=5).width == 7
+    with pytest.raises(ValueError, match="width and height must be given"):
+        Cameras(views.camera_to_world, views.intrinsics)
     none = Cameras.create(np.zeros((0, 3, 4)), np.ones(4), 7, 5)
     assert (none.width, none.height, none.by_size()) == (7, 5, [])
     with pytest.raises(ValueError, match="there are none"):
