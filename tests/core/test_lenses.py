@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from unghost.core.cameras import Cameras, warn_if_turned_away
+from unghost.core.cameras import Cameras, distort, undistort, warn_if_turned_away
 from unghost.core.frames import cube_lattices, random_rotations
 from unghost.core.lenses import fisheye_angle, fisheye_radius, widest_angle
 from unghost.core.visibility.rectangles import image_rectangles
@@ -95,6 +95,31 @@ def test_fisheye_angle_is_the_inverse_up_to_the_fold():
         reach = angle * widest_angle(bend) * 0.999
         np.testing.assert_allclose(fisheye_angle(fisheye_radius(reach, bend), bend), reach, atol=1e-10)
     assert fisheye_angle(np.array([50.0]), FOLDS)[0] == pytest.approx(widest_angle(FOLDS))
+
+
+@pytest.mark.parametrize(
+    ("bend", "reach"),
+    [
+        ([-0.25, 0.06, 0, 0, 0, 0], 1.3),  # an action camera
+        ([-0.3, 0.1, -0.01, 0, 1e-3, -2e-3], 1.2),
+        ([0.3, 0.1, 0, 0, 1e-3, 2e-3], 1.0),  # where plain iteration runs away
+        ([-0.25, 0, 0, 0, 0, 0], 1.14),  # up to where it folds, at 1.155
+    ],
+)
+def test_wide_lenses_are_undistorted_too(bend, reach):
+    bend, angle = np.array(bend, dtype=float), np.linspace(0, 2 * np.pi, 24)[:, None]
+    radius = np.linspace(0, reach, 20)
+    x, y = radius * np.cos(angle), radius * np.sin(angle)
+    np.testing.assert_allclose(undistort(*distort(x, y, bend), bend), [x, y], atol=1e-7)
+
+
+def test_image_coordinates_that_nothing_reaches_are_finite():
+    """r (1 - .25 r^2) is at most .77, at r = 1.155: 40 is the image of nothing within the lens's reach."""
+    bend = np.array([-0.25, 0, 0, 0, 0, 0])
+    found, _ = undistort(np.array([0.5, 2.0, 40.0]), np.zeros(3), bend)
+    assert distort(found[:1], np.zeros(1), bend)[0] == pytest.approx(0.5)
+    assert np.isfinite(found).all()
+    assert found[2] == pytest.approx(np.sqrt(1 / 0.75))
 
 
 def test_occlusion_beyond_the_plane():
