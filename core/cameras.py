@@ -55,19 +55,25 @@ class Cameras:
     sizes: NDArray[np.int64]
     distortion: FloatArray
     fisheye: NDArray[np.bool_]
-    _common: tuple[int, int] | None = field(repr=False, compare=False)  # the size, where all have one
+    _common: tuple[int, int] | None = field(init=False, repr=False, compare=False)  # the size, where all have one
 
     def __init__(
         self,
         camera_to_world: FloatArray,
         intrinsics: FloatArray,
-        width: int | NDArray[np.integer[Any]],
-        height: int | NDArray[np.integer[Any]],
-        distortion: FloatArray,
+        width: int | NDArray[np.integer[Any]] | None = None,
+        height: int | NDArray[np.integer[Any]] | None = None,
+        distortion: FloatArray | None = None,
         fisheye: NDArray[np.bool_] | None = None,
+        *,
+        sizes: NDArray[np.int64] | None = None,
     ) -> None:
-        """Not validated: see :meth:`create`."""
+        """Not validated: see :meth:`create`. ``sizes`` is for :func:`dataclasses.replace`."""
         count = len(camera_to_world)
+        if sizes is not None:
+            width, height = sizes[:, 0] if width is None else width, sizes[:, 1] if height is None else height
+        if width is None or height is None:
+            raise InvalidArgument("Cameras: width and height must be given")
         sides = [np.broadcast_to(np.asarray(side, dtype=np.int64), count) for side in (width, height)]
         sizes = np.stack(sides, axis=1)
         # Of no cameras at all, a size that was given as two numbers is remembered.
@@ -78,7 +84,7 @@ class Cameras:
             "camera_to_world": camera_to_world,
             "intrinsics": intrinsics,
             "sizes": sizes,
-            "distortion": distortion,
+            "distortion": np.zeros((count, 6)) if distortion is None else distortion,
             "fisheye": np.zeros(count, dtype=bool) if fisheye is None else fisheye,
             "_common": None if common is None else (int(common[0]), int(common[1])),
         }

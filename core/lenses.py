@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 
 NEWTON_STEPS = 60  # at most; 5 do for most lenses
+UNDISTORTED = 1e-9  # how far from an image coordinate, normalised, its inverse may land again
+WIDEST_TANGENT = 100.0  # 89.4 degrees off the axis: nothing farther out is looked for
 
 
 def distort(x: FloatArray, y: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -27,14 +29,58 @@ def distort(x: FloatArray, y: FloatArray, k: FloatArray) -> tuple[FloatArray, Fl
 
 
 def undistort(u: FloatArray, v: FloatArray, k: FloatArray, *, iterations: int = 12) -> tuple[FloatArray, FloatArray]:
-    """Inverse of :func:`distort` by fixed-point iteration (error < 1e-9 for phone lenses)."""
+    """Inverse of :func:`distort` by fixed-point iteration, and by Newton's method where that is off by more than 1e-9.
+
+    It is for wide lenses (a phone's have none). Image coordinates that the lens reaches from nowhere, or only from
+    beyond :func:`largest_radius`, come back as the iteration leaves them, or where it runs away at that radius.
+    """
     if not k.any():
         return u, v
     x, y = u.copy(), v.copy()
-    for _ in range(iterations):
+    with np.errstate(over="ignore", invalid="ignore"):
+        for _ in range(iterations):
+            du, dv = distort(x, y, k)
+            x, y = x + (u - du), y + (v - dv)
         du, dv = distort(x, y, k)
-        x, y = x + (u - du), y + (v - dv)
+        off = np.asarray(~(np.hypot(u - du, v - dv) < UNDISTORTED))
+    if off.any():
+        x, y = np.array(x), np.array(y)
+        x[off], y[off] = _undistort_newton(np.asarray(u)[off], np.asarray(v)[off], k, x[off], y[off])
     return x, y
+
+
+def _undistort_newton(
+    u: FloatArray, v: FloatArray, k: FloatArray, x: FloatArray, y: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """:func:`undistort` from the radial inverse on; ``x`` and ``y`` where that comes to nothing."""
+    radius, limit = np.hypot(u, v), min(largest_radius(k), WIDEST_TANGENT)
+    low, high = np.zeros_like(radius), np.full_like(radius, limit)
+    for _ in range(NEWTON_STEPS):
+        middle = (low + high) / 2
+        beyond = fisheye_radius(middle, k) > radius  # the radial terms are the same polynomial
+        low, high = np.where(beyond, low, middle), np.where(beyond, middle, high)
+    stretch = low / np.maximum(radius, 1e-12)
+    a, b = u * stretch, v * stretch
+    lost = ~(np.isfinite(x) & np.isfinite(y))
+    x, y = np.where(lost, a, x), np.where(lost, b, y)
+    k1, k2, k3, k4, p1, p2 = k
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        for _ in range(8):
+            du, dv = distort(a, b, k)
+            r2 = a * a + b * b
+            radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
+            slope = k1 + r2 * (2 * k2 + r2 * (3 * k3 + r2 * 4 * k4))  # of radial, by r2
+            ua = radial + 2 * a * a * slope + 2 * p1 * b + 6 * p2 * a
+            ub = 2 * a * b * slope + 2 * p1 * a + 2 * p2 * b
+            vb = radial + 2 * b * b * slope + 2 * p2 * a + 6 * p1 * b
+            determinant = ua * vb - ub * ub
+            a, b = (
+                a + (vb * (u - du) - ub * (v - dv)) / determinant,
+                b + (ua * (v - dv) - ub * (u - du)) / determinant,
+            )
+        du, dv = distort(a, b, k)
+        good = (np.hypot(u - du, v - dv) < UNDISTORTED) & (np.hypot(a, b) < limit)
+    return np.where(good, a, x), np.where(good, b, y)
 
 
 def largest_radius(k: FloatArray) -> float:

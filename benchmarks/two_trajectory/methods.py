@@ -79,9 +79,9 @@ def restoration(job: Job, **over: Any) -> list[Outcome]:
 
 def judged(job: Job, base: Any, model: str = "default") -> Judgement:
     denoiser = load_denoiser(model, backend="onnx", threads=job.threads)
-    return judge(
-        base.density_fn, base.aabb, denoiser=denoiser, cameras=job.scene.train.cameras, field_pitch=base.field_pitch
-    )
+    looks = {"view_count", "transmittance"} & set(denoiser.manifest.channels)
+    cameras = job.scene.train.cameras if looks else None
+    return judge(base.density_fn, base.aabb, denoiser=denoiser, cameras=cameras, field_pitch=base.field_pitch)
 
 
 def _doubted(outcome: Outcome) -> Outcome:

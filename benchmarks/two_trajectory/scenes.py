@@ -48,9 +48,9 @@ class Sweep:
         first, second = self.cameras, other.cameras
         parts = [
             np.concatenate([getattr(first, name), getattr(second, name)])
-            for name in ("camera_to_world", "intrinsics", "distortion")
+            for name in ("camera_to_world", "intrinsics", "sizes", "distortion", "fisheye")
         ]
-        cameras = Cameras.create(parts[0], parts[1], first.width, first.height, parts[2])
+        cameras = Cameras.create(parts[0], parts[1], *parts[2].T, *parts[3:])
         return Sweep(cameras, np.concatenate([self.photos, other.photos]))
 
 

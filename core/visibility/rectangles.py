@@ -25,6 +25,12 @@ def image_rectangles(cameras: Cameras) -> tuple[FloatArray, FloatArray]:
         two ``(N, 4)``: left, right, top, bottom. Where the lens cannot be undistorted to its border, the first is
         empty (NaN) and the second everything (infinite). A fisheye so wide that its border has no such coordinates
         has a square about its axis as the first.
+
+    Example:
+        >>> lens = np.array([10.0, 10.0, 8.0, 6.0])  # a pinhole: both are the image's own
+        >>> sure, possible = image_rectangles(Cameras.create(np.eye(3, 4)[None], lens, 16, 12))
+        >>> sure.tolist(), bool((sure == possible).all())
+        ([[-0.8, 0.8, -0.6, 0.6]], True)
     """
     fx, fy, cx, cy = cameras.intrinsics.T
     width, height = cameras.sizes.T
@@ -44,6 +50,11 @@ def side_normals(cameras: Cameras, rectangles: FloatArray) -> FloatArray:
     """The four planes of each camera's rectangle ``(N, 4)``: normals ``(N, 4, 3)`` in world axes, any length.
 
     A point ``p`` is within a side if ``(p - origin) . normal >= 0``; a side that is not finite has the normal 0.
+
+    Example:
+        >>> cameras = Cameras.create(np.eye(3, 4)[None], np.array([10.0, 10.0, 8.0, 6.0]), 16, 12)
+        >>> (side_normals(cameras, image_rectangles(cameras)[0])[0] @ [0.7, 0.0, -1.0] >= 0).tolist()
+        [True, True, True, True]
     """
     bounded = np.isfinite(rectangles)
     left, right, top, bottom = np.where(bounded, rectangles, 0.0).T

@@ -9,8 +9,7 @@ from ..cameras import Cameras, distort, largest_radius, undistort
 from ..errors import InvalidArgument
 from ..frames import RESOLUTION, cube_lattices, unit_lattice
 from ..shards.storage import MAX_VIEW_COUNT
-from .rectangles import BORDER_POINTS as BORDER_POINTS
-from .rectangles import image_rectangles, side_normals
+from .rectangles import BORDER_POINTS, image_rectangles, side_normals
 
 
 def frustum_normals(cameras: Cameras) -> NDArray[np.float64]:

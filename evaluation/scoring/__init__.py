@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from .renders import read_photos as read_photos
     from .views import Renders as Renders
     from .views import Truth as Truth
+    from .views import pad_views as pad_views
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
@@ -58,6 +59,6 @@ __getattr__, __dir__, __all__ = attach(
         ".intervals": ["Interval", "bootstrap_scenes"],
         ".pseudo_truth": ["PseudoTruth", "check_cameras", "load_pseudo_truth", "make_pseudo_truth"],
         ".renders": ["Method", "match_names", "read_map", "read_masks", "read_method", "read_photos"],
-        ".views": ["Renders", "Truth"],
+        ".views": ["Renders", "Truth", "pad_views"],
     },
 )

@@ -172,6 +172,11 @@ def pad_views(views: Sequence[NDArray[Any]], canvas: tuple[int, int], fill: Any)
     """Arrays ``(h, w, ...)`` of views as one ``(n, H, W, ...)``, each in the upper left corner of ``canvas (H, W)``.
 
     Equal views that fill the canvas are stacked.
+
+    Example:
+        >>> portrait, landscape = np.ones((3, 2)), np.full((2, 3), 4.0)
+        >>> pad_views([portrait, landscape], (3, 3), np.inf)[1].tolist()
+        [[4.0, 4.0, 4.0], [4.0, 4.0, 4.0], [inf, inf, inf]]
     """
     if all(view.shape[:2] == canvas for view in views):
         return np.stack(views)

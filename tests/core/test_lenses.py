@@ -1,5 +1,6 @@
 """Fisheyes, against OpenCV's formula written out; and cameras that differ in size."""
 
+import dataclasses
 import pickle
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from unghost.core.cameras import Cameras, warn_if_turned_away
+from unghost.core.cameras import Cameras, distort, undistort, warn_if_turned_away
 from unghost.core.frames import cube_lattices, random_rotations
 from unghost.core.lenses import fisheye_angle, fisheye_radius, widest_angle
 from unghost.core.visibility.rectangles import image_rectangles
@@ -96,6 +97,31 @@ def test_fisheye_angle_is_the_inverse_up_to_the_fold():
     assert fisheye_angle(np.array([50.0]), FOLDS)[0] == pytest.approx(widest_angle(FOLDS))
 
 
+@pytest.mark.parametrize(
+    ("bend", "reach"),
+    [
+        ([-0.25, 0.06, 0, 0, 0, 0], 1.3),  # an action camera
+        ([-0.3, 0.1, -0.01, 0, 1e-3, -2e-3], 1.2),
+        ([0.3, 0.1, 0, 0, 1e-3, 2e-3], 1.0),  # where plain iteration runs away
+        ([-0.25, 0, 0, 0, 0, 0], 1.14),  # up to where it folds, at 1.155
+    ],
+)
+def test_wide_lenses_are_undistorted_too(bend, reach):
+    bend, angle = np.array(bend, dtype=float), np.linspace(0, 2 * np.pi, 24)[:, None]
+    radius = np.linspace(0, reach, 20)
+    x, y = radius * np.cos(angle), radius * np.sin(angle)
+    np.testing.assert_allclose(undistort(*distort(x, y, bend), bend), [x, y], atol=1e-7)
+
+
+def test_image_coordinates_that_nothing_reaches_are_finite():
+    """r (1 - .25 r^2) is at most .77, at r = 1.155: 40 is the image of nothing within the lens's reach."""
+    bend = np.array([-0.25, 0, 0, 0, 0, 0])
+    found, _ = undistort(np.array([0.5, 2.0, 40.0]), np.zeros(3), bend)
+    assert distort(found[:1], np.zeros(1), bend)[0] == pytest.approx(0.5)
+    assert np.isfinite(found).all()
+    assert found[2] == pytest.approx(np.sqrt(1 / 0.75))
+
+
 def test_occlusion_beyond_the_plane():
     """90 to 115 degrees: depth along the axis falls with the distance, and what lies behind is hidden all the same."""
     view = fisheye(np.zeros(6), lens=(20.0, 20.0, 40.0, 40.0), width=80, height=80)
@@ -182,6 +208,13 @@ def test_sizes_of_cameras_that_differ():
     again = pickle.loads(pickle.dumps(views))
     assert (again.sizes == views.sizes).all()
     assert not again.same_size
+    moved = dataclasses.replace(views, camera_to_world=views.camera_to_world[::-1])
+    assert (moved.sizes == views.sizes).all()
+    assert (moved.fisheye == views.fisheye).all()
+    assert (moved.origins == views.origins[::-1]).all()
+    assert dataclasses.replace(views, width=7, height=5).width == 7
+    with pytest.raises(ValueError, match="width and height must be given"):
+        Cameras(views.camera_to_world, views.intrinsics)
     none = Cameras.create(np.zeros((0, 3, 4)), np.ones(4), 7, 5)
     assert (none.width, none.height, none.by_size()) == (7, 5, [])
     with pytest.raises(ValueError, match="there are none"):

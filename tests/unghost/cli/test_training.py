@@ -63,7 +63,7 @@ def test_a_configuration_file_keeps_its_channels(shard, tmp_path):
         (["--online", "procedural"], "--online must be RECIPE=SHARE, the share in (0, 1], got 'procedural'"),
         (["--online", "procedural=2"], "--online must be RECIPE=SHARE"),
         (["--online", "absent=.5"], "load_recipe: absent is neither a file nor a built-in recipe"),
-        (["--online", "meshes=.5"], "mesh_root"),
+        (["--online", "meshes=.5"], "--mesh-root"),
         (["--online", "procedural=1"], "Blend: shards, and 0 of"),
     ],
 )

@@ -38,19 +38,21 @@ class UnghostNerfactoModelConfig(NerfactoModelConfig):  # type: ignore[misc]
 def cameras_of(cameras: Any) -> Cameras:
     """nerfstudio's cameras as ours: the same poses; images of any size are scaled to the first one's.
 
-    Only what a frustum test needs survives: intrinsics relative to the image, distortion k1 to k4, p1, p2.
+    Only what a frustum test needs survives: intrinsics relative to the image, distortion k1 to k4, p1, p2, and which
+    are fisheyes (nerfstudio's are OPENCV_FISHEYE).
 
     Args:
-        cameras: ``nerfstudio.cameras.cameras.Cameras`` of one dimension, perspective ones.
+        cameras: ``nerfstudio.cameras.cameras.Cameras`` of one dimension, perspective ones or fisheyes.
 
     Raises:
         ValueError: a camera of another kind.
     """
     from nerfstudio.cameras.cameras import CameraType
 
-    kinds = {int(kind) for kind in np.asarray(cameras.camera_type.cpu()).ravel()}
-    if kinds != {CameraType.PERSPECTIVE.value}:
-        raise InvalidArgument(f"cameras_of: cameras must be perspective ones, got camera_type {sorted(kinds)}")
+    kinds = np.asarray(cameras.camera_type.cpu()).ravel()
+    if not np.isin(kinds, (CameraType.PERSPECTIVE.value, CameraType.FISHEYE.value)).all():
+        found = sorted(set(kinds.tolist()))
+        raise InvalidArgument(f"cameras_of: cameras must be perspective ones or fisheyes, got camera_type {found}")
     width, height = (side.reshape(-1).double().cpu().numpy() for side in (cameras.width, cameras.height))
     scale = np.stack([width[0] / width, height[0] / height] * 2, axis=1)
     lens = np.stack([getattr(cameras, name).reshape(-1).double().cpu().numpy() for name in ("fx", "fy", "cx", "cy")], 1)
@@ -61,6 +63,7 @@ def cameras_of(cameras: Any) -> Cameras:
         int(width[0]),
         int(height[0]),
         None if bend is None else bend.double().cpu().numpy(),
+        kinds == CameraType.FISHEYE.value,
     )
 
 
