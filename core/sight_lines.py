@@ -182,7 +182,7 @@ def _segments(
 def _outnumbered(places: FloatArray, count: NDArray[np.int64], near: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Which points (in cells) lie in a cell that more lines cross than observations end near."""
     cells = np.floor(places).astype(np.int64)
-    inside: NDArray[np.bool_] = ((cells >= 0) & (cells < np.array(count.shape))).all(axis=1)
+    inside: NDArray[np.bool_] = np.logical_and.reduce((cells >= 0) & (cells < np.array(count.shape)), axis=1)
     index = tuple(np.where(inside[:, None], cells, 0).T)
     outnumbered: NDArray[np.bool_] = inside & (count[index] > near[index])
     return outnumbered
