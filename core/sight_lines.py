@@ -33,7 +33,9 @@ class SightLines:
     """Line and point counts on a grid of cubic cells, built by :meth:`build`.
 
     Attributes:
-        starts, ends: ``(L, 3)`` of the segments, scene units: the camera, and the point less its margin.
+        starts, ends: ``(L, 3)`` of the segments, scene units: from the camera to the point less its margin, as far as
+            they lie in the box.
+        targets: ``(L, 3)`` the points that were observed, scene units; some may lie outside the box.
         crossing_count: ``(X, Y, Z)`` int32, how many segments pass through each cell.
         support_sum: ``(X, Y, Z)`` float32 at the cells' centres, how many points lie near, each with a tent-shaped
             weight that is 1 at the point and 0 from ``REACH`` cells on, along each axis.
@@ -53,6 +55,7 @@ class SightLines:
 
     starts: FloatArray
     ends: FloatArray
+    targets: FloatArray
     crossing_count: NDArray[np.int32]
     support_sum: NDArray[np.float32]
     aabb: FloatArray
@@ -66,6 +69,7 @@ class SightLines:
         *,
         aabb: ArrayLike,
         pitch: float,
+        field_pitch: float | None = None,
         margin_cells: float = MARGIN_CELLS,
         margin_sigmas: float = MARGIN_SIGMAS,
         robust: bool = True,
@@ -76,8 +80,9 @@ class SightLines:
             points: in the frame of ``cameras``, whose indices its observations use.
             cameras: that observed them.
             aabb: ``(2, 3)`` box to cover, scene units; lines from and to places beyond it count where they pass inside.
-            pitch: side of the cells, scene units: the field's own.
-            margin_cells: a segment ends this many cells before its point,
+            pitch: side of the cells of the grid, scene units.
+            field_pitch: side of the field's own cells, scene units; None for ``pitch``.
+            margin_cells: a segment ends this many of the field's cells before its point,
             margin_sigmas: and this many times the point's uncertainty before that. Points whose rays do not determine
                 them give no line.
             robust: drop wrong points and lines by majority. A point in a cell that more lines cross than observations
@@ -97,8 +102,10 @@ class SightLines:
             raise InvalidArgument(f"SightLines: pitch {pitch} makes {sides.prod():.3g} cells, at most {MOST_CELLS}")
         shape = tuple(int(side) for side in np.maximum(sides, 1))
         origin = lattice_origin(box, pitch, shape)
-        starts, ends, owner = _segments(points, cameras, margin_cells * pitch, margin_sigmas)
-        grid = _Grid(shape, (starts - origin) / pitch, (ends - origin) / pitch)
+        margin = margin_cells * (pitch if field_pitch is None else field_pitch)
+        starts, ends, owner = _segments(points, cameras, margin, margin_sigmas)
+        starts, ends, meets = _clipped((starts - origin) / pitch, (ends - origin) / pitch, shape)
+        owner, grid = owner[meets], _Grid(shape, starts, ends)
         places, right, kept = (
             (points.xyz - origin) / pitch,
             np.ones(len(points), dtype=bool),
@@ -113,7 +120,9 @@ class SightLines:
             kept = right[owner] & ~grid.hit(np.greater(surface, np.maximum(count, 1)), short_of=SURFACE_REACH)
             count -= grid.count(right[owner] & ~kept)
         support = _tents(places[right], shape)
-        return cls(starts[kept], ends[kept], count.astype(np.int32), support, box, float(pitch))
+        starts, ends = (origin + each[kept] * pitch for each in (starts, ends))
+        targets = points.xyz[owner[kept]]
+        return cls(starts, ends, targets, count.astype(np.int32), support, box, float(pitch))
 
     def __len__(self) -> int:
         return len(self.starts)
@@ -151,6 +160,29 @@ class SightLines:
         along = self.ends[which] - self.starts[which]
         share = (np.arange(samples) + rng.random((count, samples))) / samples
         return self.starts[which][:, None] + share[..., None] * along[:, None], np.linalg.norm(along, axis=1)
+
+    def sample_ends(
+        self, rng: np.random.Generator, count: int, *, reach: float, samples: int = 8
+    ) -> tuple[FloatArray, float]:
+        """Draw points about the observed points of random sight lines, along the lines, stratified.
+
+        Args:
+            rng: draws lines with replacement among those whose point lies in the box.
+            count: number of lines; fewer come back if no point lies in the box.
+            reach: how far before and behind the point, scene units.
+            samples: points a line.
+
+        Returns:
+            positions ``(count, samples, 3)`` and the length that they cover, ``2 * reach``.
+        """
+        inside = np.flatnonzero(((self.targets >= self.aabb[0]) & (self.targets <= self.aabb[1])).all(axis=1))
+        if not len(inside):
+            return np.zeros((0, samples, 3)), 2 * reach
+        which = inside[rng.integers(len(inside), size=count)]
+        along = self.targets[which] - self.starts[which]
+        along /= np.linalg.norm(along, axis=1, keepdims=True)
+        offset = reach * (2 * (np.arange(samples) + rng.random((count, samples))) / samples - 1)
+        return self.targets[which][:, None] + offset[..., None] * along[:, None], 2 * reach
 
     def _look_up(self, values: NDArray[Any], positions: NDArray[Any]) -> NDArray[np.float32]:
         places = np.asarray(positions, dtype=np.float64)
@@ -205,15 +237,15 @@ def _clipped(
 
 
 class _Grid:
-    """Segments ``(L, 3)`` through a grid of cells, in cells."""
+    """Segments ``(L, 3)`` within a grid of cells, in cells."""
 
     def __init__(self, shape: tuple[int, ...], starts: FloatArray, ends: FloatArray) -> None:
-        self.shape, self.size, self.whole = shape, int(np.prod(shape)), (starts, ends)
-        self.starts, self.ends, self.meets = _clipped(starts, ends, shape)
+        self.shape, self.size = shape, int(np.prod(shape))
+        self.starts, self.ends = starts, ends
 
     def count(self, chosen: NDArray[np.bool_]) -> NDArray[np.int64]:
         """How many of the chosen segments ``(L,)`` pass through each cell."""
-        lines = np.flatnonzero(chosen[self.meets])
+        lines = np.flatnonzero(chosen)
 
         def counted(part: NDArray[np.int64]) -> NDArray[np.int64]:
             total = np.zeros(self.size, dtype=np.int64)
@@ -226,10 +258,13 @@ class _Grid:
 
     def hit(self, marked: NDArray[np.bool_], *, short_of: float) -> NDArray[np.bool_]:
         """Which segments ``(L,)`` pass through a marked cell farther than ``short_of`` cells from their end."""
-        along = self.whole[1] - self.whole[0]
+        along = self.ends - self.starts
         length = np.linalg.norm(along, axis=1)
         share = np.maximum(1.0 - short_of / np.maximum(length, 1e-300), 0.0)
-        return _Grid(self.shape, self.whole[0], self.whole[0] + share[:, None] * along)._hit(marked)
+        long = share > 0
+        result = np.zeros(len(along), dtype=bool)
+        result[long] = _Grid(self.shape, self.starts[long], (self.starts + share[:, None] * along)[long])._hit(marked)
+        return result
 
     def _hit(self, marked: NDArray[np.bool_]) -> NDArray[np.bool_]:
         flat, result = marked.ravel(), np.zeros(len(self.starts), dtype=bool)
@@ -241,9 +276,7 @@ class _Grid:
                     result[lines[line[flat[cells]]]] = True
 
         _in_threads(mark, np.arange(len(self.starts)))
-        whole = np.zeros(len(self.meets), dtype=bool)
-        whole[self.meets] = result
-        return whole
+        return result
 
     def _crossed(self, lines: NDArray[np.int64]) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
         """Positions in ``lines`` and flat indices of the cells that those segments pass through, each cell once.

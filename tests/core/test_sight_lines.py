@@ -123,7 +123,8 @@ def test_uncertain_points_keep_their_distance():
 def test_samples_lie_on_their_lines():
     cameras = rig()
     points = observed(np.zeros((4, 3)), cameras)
-    lines = SightLines.build(points, cameras, aabb=BOX, pitch=0.1, margin_sigmas=0.0, robust=False)
+    wide = [[-3.0] * 3, [3.0] * 3]
+    lines = SightLines.build(points, cameras, aabb=wide, pitch=0.1, margin_sigmas=0.0, robust=False)
     places, lengths = lines.sample(np.random.default_rng(0), 100, samples=8)
     assert places.shape == (100, 8, 3)
     assert lengths == pytest.approx(np.full(100, 2.3), abs=1e-9)
@@ -131,6 +132,16 @@ def test_samples_lie_on_their_lines():
     assert (np.diff(radius, axis=1) < 0).all()  # from the camera inwards, one in each part
     assert radius.min() > 0.2
     assert len(np.unique(places[:, 0].round(3), axis=0)) > 50
+    ends, covered = lines.sample_ends(np.random.default_rng(0), 50, reach=0.2)
+    assert covered == 0.4
+    radius = np.linalg.norm(ends, axis=-1)
+    assert radius.max() < 0.2
+    assert radius.min(axis=1).max() < 0.06
+    assert (np.linalg.svd(ends - ends.mean(axis=1, keepdims=True), compute_uv=False)[:, 1] < 1e-9).all()
+    inner = SightLines.build(points, cameras, aabb=BOX, pitch=0.1, margin_sigmas=0.0, robust=False)
+    places, lengths = inner.sample(np.random.default_rng(0), 200)
+    assert (places >= BOX[0] - 1e-9).all()
+    assert (places <= BOX[1] + 1e-9).all()
 
 
 def ball_on_a_floor(photos, count, wrong, seed=0):
