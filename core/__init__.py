@@ -102,6 +102,9 @@ if TYPE_CHECKING:
     from .schedule import flip_log_odds as flip_log_odds
     from .schedule import strided_timesteps as strided_timesteps
     from .schedule import timestep_from_severity as timestep_from_severity
+    from .sight_lines import SightLines as SightLines
+    from .sparse_points import SparsePoints as SparsePoints
+    from .sparse_points import warn_if_not_in_view as warn_if_not_in_view
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
@@ -171,5 +174,7 @@ __getattr__, __dir__, __all__ = attach(
             "strided_timesteps",
             "timestep_from_severity",
         ],
+        ".sight_lines": ["SightLines"],
+        ".sparse_points": ["SparsePoints", "warn_if_not_in_view"],
     },
 )

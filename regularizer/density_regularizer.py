@@ -28,15 +28,27 @@ from ..core.cameras import Cameras, warn_if_turned_away
 from ..core.manifest import Denoiser
 from ..core.occupancy import EMPTY, opacity_from_density, warn_if_constant
 from ..core.schedule import check_timestep
+from ..core.sight_lines import MARGIN_CELLS, SightLines
+from ..core.sparse_points import SparsePoints, warn_if_not_in_view
 from .cube_channels import FollowedRays, complete_channels, cube_surroundings
 from .cubes import CubeBatch, FieldPitch, draw_cubes, wide_dtype
-from .losses import cube_parts, cubewise_mean, dsds_loss, stable_mean, visibility_loss
+from .losses import (
+    cube_parts,
+    cubewise_mean,
+    dsds_loss,
+    end_point_loss,
+    sight_line_loss,
+    stable_mean,
+    visibility_loss,
+)
 from .proposals import ImportanceGrid
 from .settings import SURE, RegularizerSettings
 from .tensor_queries import DensityFn, query_tensors
 from .visibility import ViewCounter, grow_box, visibility_points
 
 NOMINAL_CELLS = 128  # a field whose pitch is unknown is taken to have this many cells along the longest side
+MOST_LINE_CELLS = 192  # along the longest side of the grid on which sight lines and points outvote each other
+LOSSES = ("dsds", "visibility", "sight_lines")
 POINTS_PER_CELL = 4  # asked of the field to fill the importance grid at the first call
 
 
@@ -45,7 +57,8 @@ class DensityRegularizer:
 
     Each call draws cubes of the scene where there is matter, asks the field for their densities, lets the
     denoiser say what should be there (one step, no gradient through it), and returns the DSDS loss (the
-    paper, eq. 2); and penalises density where no camera looks (eq. 3).
+    paper, eq. 2); penalises density where no camera looks (eq. 3); and, given the sparse points of the
+    structure-from-motion model, density on sight lines between cameras and the points that they observed.
 
     Departures from the paper: under the opacity rule (the default) the losses act on the optical depth
     ``density * pitch`` rather than on the density, so the weights do not depend on the scene's unit, and a voxel
@@ -63,6 +76,8 @@ class DensityRegularizer:
         depth_maps: ``(cameras, height, width)`` of theirs (a list where they differ in size), along the optical axis,
             inf for nothing: the visibility loss then counts only cameras from which nothing hides a point (the paper:
             every camera that has it in view).
+        points: of the training photos, in the frame of ``cameras``, whose indices its observations use; None for no
+            sight-line loss. For anything that is scored, triangulated from the training photos alone.
         field_pitch: side of the field's own cells in scene units, or a function of cube centres ``(N, 3)``
             that gives it as ``(N,)`` (a contracted field); None if unknown: then the cube's voxel.
         device: where positions are created; None for the device of the field's parameters, else the CPU.
@@ -71,7 +86,8 @@ class DensityRegularizer:
     Attributes:
         grid: the importance grid.
         step: calls so far; cubes of step s depend on (seed, s) and the grid alone.
-        report: counts of the last call: cubes, skipped_empty, denoised, voxels, outside, dropped, points, unseen.
+        report: counts of the last call: cubes, skipped_empty, denoised, voxels, outside, dropped, points, unseen,
+            lines.
         totals: the same since the start, and observations_outside.
 
     Example:
@@ -83,7 +99,7 @@ class DensityRegularizer:
         >>> losses = regularizer(density_fn)
         >>> sum(losses.values()).backward()  # add them to your photometric loss
         >>> sorted(losses), bool(torch.isfinite(level.grad))
-        (['dsds', 'visibility'], True)
+        (['dsds', 'sight_lines', 'visibility'], True)
     """
 
     def __init__(
@@ -93,6 +109,7 @@ class DensityRegularizer:
         aabb: ArrayLike,
         cameras: Cameras | None = None,
         depth_maps: NDArray[np.floating] | Sequence[NDArray[np.floating]] | None = None,
+        points: SparsePoints | None = None,
         field_pitch: FieldPitch = None,
         device: torch.device | str | None = None,
         settings: RegularizerSettings | None = None,
@@ -119,6 +136,7 @@ class DensityRegularizer:
             warn_if_turned_away(cameras, self.aabb, caller="DensityRegularizer")
             reach = grow_box(self.aabb, s.visibility_reach)
             self._views = ViewCounter(cameras, min_views=s.min_views, aabb=reach, depth_maps=depth_maps)
+        self.lines = self._sight_lines_of(points)
         self._viewing = viewing_cameras(cameras, denoiser.manifest.channels)
         self._rays = FollowedRays(denoiser.manifest.channels, cameras, self.aabb, every=s.light_steps)
         self.step = 0
@@ -133,8 +151,8 @@ class DensityRegularizer:
                 them, the main field first (proposal networks must be cleaned too). All see the same cubes.
 
         Returns:
-            ``{"dsds": …, "visibility": …}``: scalars (float64, so that no finite density overflows), exactly zero
-            where switched off, and at the steps between (``every``).
+            ``{"dsds": …, "visibility": …, "sight_lines": …}``: scalars (float64, so that no finite density overflows),
+            exactly zero where switched off, and at the steps between (``every``).
 
         Raises:
             TypeError, ValueError: what a callable returned is no tensor, of the wrong shape, NaN, infinite, negative.
@@ -150,12 +168,33 @@ class DensityRegularizer:
         device = torch.device(self.device if self.device is not None else field_device(fields[0]) or "cpu")
         self.report = Counter()
         if self.step % self.settings.every:
-            losses = {name: torch.zeros((), dtype=wide_dtype(device), device=device) for name in ("dsds", "visibility")}
+            losses = {name: torch.zeros((), dtype=wide_dtype(device), device=device) for name in LOSSES}
         else:
-            losses = {"dsds": self._dsds(fields, device), "visibility": self._visibility(fields, device)}
+            losses = {
+                "dsds": self._dsds(fields, device),
+                "visibility": self._visibility(fields, device),
+                "sight_lines": self._sight_lines(fields, device),
+            }
         self.totals.update(self.report)
         self.step += 1
         return losses
+
+    def _sight_lines_of(self, points: SparsePoints | None) -> SightLines | None:
+        """Lines in the box that the visibility loss reaches; the loss may ask the field anywhere in it."""
+        s = self.settings
+        if points is None or not len(points):
+            return None
+        if self.cameras is None:
+            raise InvalidArgument("DensityRegularizer: points must come with cameras, got cameras=None")
+        if len(points.camera) and int(points.camera.max()) >= len(self.cameras):
+            raise InvalidArgument(
+                f"DensityRegularizer: points must refer to the {len(self.cameras)} cameras, "
+                f"got camera {int(points.camera.max())}"
+            )
+        warn_if_not_in_view(points, self.cameras, caller="DensityRegularizer")
+        box, cell = grow_box(self.aabb, s.visibility_reach), self._nominal_pitch()
+        pitch = max(cell, scene_extent(box) / MOST_LINE_CELLS)
+        return SightLines.build(points, self.cameras, aabb=box, pitch=pitch, field_pitch=cell)
 
     def observe(self, positions: Any, values: Any, *, kind: Literal["density", "weight"] = "density") -> None:
         """Tell the importance grid what you rendered anyway; never needed, always cheap.
@@ -327,6 +366,33 @@ class DensityRegularizer:
             loss = visibility_loss(depth, views, min_views=s.min_views)
             total = total + stable_mean(torch.where(valid, loss, torch.zeros_like(loss)), count=len(points))
         return total * s.visibility_weight
+
+    def _sight_lines(self, fields: list[DensityFn], device: torch.device) -> Tensor:
+        s, lines = self.settings, self.lines
+        zero = torch.zeros((), dtype=wide_dtype(device), device=device)
+        if lines is None or not len(lines) or s.sight_lines == 0:
+            return zero
+        total = zero
+        if s.sight_line_weight > 0:
+            places, lengths = lines.sample(self._rng(3), s.sight_lines, samples=s.sight_line_samples)
+            self.report["lines"] += len(places)
+            length = torch.as_tensor(lengths, dtype=torch.float32, device=device)
+            for field in fields:
+                density = self._on_lines(field, places, device)
+                total = total + stable_mean(sight_line_loss(density, length)) * s.sight_line_weight
+        if s.end_point_weight > 0:
+            reach = MARGIN_CELLS * self._nominal_pitch()
+            places, covered = lines.sample_ends(self._rng(4), s.sight_lines, reach=reach)
+            for field in fields if len(places) else ():
+                density = self._on_lines(field, places, device)
+                total = total + stable_mean(end_point_loss(density, covered)) * s.end_point_weight
+        return total
+
+    def _on_lines(self, field: DensityFn, places: NDArray[np.float64], device: torch.device) -> Tensor:
+        """Densities ``(L, S)``; 0 where they are dropped."""
+        positions = torch.as_tensor(places.reshape(-1, 3), dtype=torch.float32, device=device)
+        density, valid = self._query(field, positions)
+        return torch.where(valid, density, torch.zeros_like(density)).reshape(places.shape[:2])
 
 
 def _as_float64(values: Any) -> NDArray[np.float64]:

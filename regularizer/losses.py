@@ -108,6 +108,55 @@ def visibility_loss(density: Tensor, view_count: Tensor, *, min_views: int = 1) 
     return torch.where(view_count < min_views, values, torch.zeros_like(values))
 
 
+def sight_line_loss(density: Tensor, length: Tensor | float) -> Tensor:
+    """Opacity of sight lines, which measured free space: ``1 - exp(-optical depth)``.
+
+    Args:
+        density: ``(L, S)``, >= 0, per scene unit, at places spread evenly over each line.
+        length: ``(L,)`` or a number, scene units.
+
+    Returns:
+        ``(L,)`` in [0, 1), at least float32: 0 for clear lines.
+
+    Raises:
+        ValueError: ``length`` does not fit.
+
+    Example:
+        >>> sight_line_loss(torch.tensor([[0.0, 0.0], [1.0, 3.0]]), torch.tensor([5.0, 0.5])).tolist()
+        [0.0, 0.6321205496788025]
+    """
+    return -torch.expm1(-_line_depth("sight_line_loss", density, length))
+
+
+def end_point_loss(density: Tensor, length: Tensor | float) -> Tensor:
+    """Transparency of short segments about observed points, which measured matter: ``exp(-optical depth)``.
+
+    Args:
+        density: ``(L, S)``, >= 0, per scene unit, at places spread evenly over each segment.
+        length: ``(L,)`` or a number, scene units.
+
+    Returns:
+        ``(L,)`` in (0, 1], at least float32: 0 for opaque segments.
+
+    Raises:
+        ValueError: ``length`` does not fit.
+
+    Example:
+        >>> end_point_loss(torch.tensor([[0.0, 0.0], [1.0, 3.0]]), 0.5).tolist()
+        [1.0, 0.3678794503211975]
+    """
+    return torch.exp(-_line_depth("end_point_loss", density, length))
+
+
+def _line_depth(caller: str, density: Tensor, length: Tensor | float) -> Tensor:
+    if density.ndim != 2 or (isinstance(length, Tensor) and length.shape != density.shape[:1]):
+        raise InvalidArgument(
+            f"{caller}: density must be (L, S) and length (L,), got {tuple(density.shape)} and "
+            f"{tuple(length.shape) if isinstance(length, Tensor) else length}"
+        )
+    return upcast(density).mean(dim=1) * length
+
+
 def stable_mean(loss: Tensor, *, count: int | None = None) -> Tensor:
     """Mean that no finite loss can overflow: each term is divided before the sum, which runs in float64.
 

@@ -43,6 +43,9 @@ class RegularizerSettings:
         visibility_samples: points a step for the visibility loss.
         visibility_kind: ``"mixed"``, ``"rays"`` (the paper) or ``"uniform"`` points.
         visibility_reach: how many times the aabb those points may go out to, >= 1.
+        sight_line_weight, end_point_weight: factors of the two terms of the sight-line loss, which needs ``points``:
+            the mean opacity of random sight lines, and the mean transparency of four field cells about their points.
+        sight_lines, sight_line_samples: lines a step for each term, and places on each.
         light_steps: for a denoiser that asks how well the photos see a place through the field: steps after which
             the rays are followed anew.
         min_views: points seen by fewer cameras are penalised (1: the paper).
@@ -74,6 +77,10 @@ class RegularizerSettings:
     visibility_samples: int = 32768
     visibility_kind: PointKind = "mixed"
     visibility_reach: float = 1.0
+    sight_line_weight: float = 0.03
+    end_point_weight: float = 0.01
+    sight_lines: int = 4096
+    sight_line_samples: int = 12
     light_steps: int = 50
     min_views: int = 1
     rule: OccupancyRule = dataclasses.field(default_factory=OccupancyRule)
@@ -90,6 +97,16 @@ class RegularizerSettings:
             "cubes": (self.cubes >= 0, ">= 0"),
             "every": (self.every >= 1, ">= 1"),
             "visibility_samples": (self.visibility_samples >= 0, ">= 0"),
+            "sight_lines": (self.sight_lines >= 0, ">= 0"),
+            "sight_line_samples": (self.sight_line_samples >= 1, ">= 1"),
+            "sight_line_weight": (
+                math.isfinite(self.sight_line_weight) and self.sight_line_weight >= 0,
+                "finite and >= 0",
+            ),
+            "end_point_weight": (
+                math.isfinite(self.end_point_weight) and self.end_point_weight >= 0,
+                "finite and >= 0",
+            ),
             "light_steps": (self.light_steps >= 1, ">= 1"),
             "min_views": (self.min_views >= 1, ">= 1"),
             "chunk": (self.chunk >= 1, ">= 1"),

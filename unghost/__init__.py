@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from .core.cameras import Cameras as Cameras
     from .core.errors import UnghostError as UnghostError
     from .core.occupancy import OccupancyRule as OccupancyRule
+    from .core.sight_lines import SightLines as SightLines
+    from .core.sparse_points import SparsePoints as SparsePoints
     from .denoisers import load_denoiser as load_denoiser
     from .denoisers import shipped_names as shipped_names
     from .evaluation.captures.loading import Capture as Capture
@@ -50,6 +52,8 @@ __getattr__, __dir__, __all__ = attach(
         ".core.cameras": ["Cameras"],
         ".core.errors": ["UnghostError"],
         ".core.occupancy": ["OccupancyRule"],
+        ".core.sight_lines": ["SightLines"],
+        ".core.sparse_points": ["SparsePoints"],
         ".denoisers": ["load_denoiser", "shipped_names"],
         ".evaluation.captures.loading": ["Capture", "load_cameras", "load_capture"],
         ".evaluation.scoring.evaluation": ["evaluate"],

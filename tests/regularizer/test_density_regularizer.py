@@ -27,7 +27,7 @@ def test_a_constant_field_by_hand(kit, aabb, kind):
     level = torch.tensor(2.0, requires_grad=True)  # optical depth 0.25: opacity .22
     regularizer, denoiser = build(kit, aabb, kit.all_empty, kind=kind)
     losses = regularizer(density_fn)
-    assert set(losses) == {"dsds", "visibility"}
+    assert set(losses) == {"dsds", "visibility", "sight_lines"}
     assert losses["dsds"].item() == pytest.approx(0.25, rel=1e-6)  # m * density * pitch
     assert losses["visibility"].item() == 0.0
     losses["dsds"].backward()
@@ -417,7 +417,7 @@ def test_a_pitch_that_varies_in_space(kit, aabb):
 
 def test_no_cubes_and_no_points_are_no_loss(kit, aabb, lone_camera):
     regularizer, _ = build(kit, aabb, kit.identity, cubes=0, visibility_samples=0, cameras=lone_camera)
-    assert [loss.item() for loss in regularizer(lambda p: p[:, 0]).values()] == [0.0, 0.0]
+    assert [loss.item() for loss in regularizer(lambda p: p[:, 0]).values()] == [0.0, 0.0, 0.0]
 
 
 def test_a_camera_inside_a_cube_and_all_full_and_all_empty(kit, aabb, lone_camera):

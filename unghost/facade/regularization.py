@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core.cameras import Cameras
 from ..core.manifest import Denoiser
+from ..core.sparse_points import SparsePoints
 from ..denoisers import load_denoiser
 from ..regularizer.cubes import FieldPitch
 from ..regularizer.density_regularizer import DensityRegularizer as RequiredDenoiserRegularizer
@@ -17,7 +18,7 @@ from ..regularizer.settings import RegularizerSettings
 
 
 class DensityRegularizer(RequiredDenoiserRegularizer):
-    """Add a learned prior over local geometry, and a visibility prior, to the loss of any radiance field.
+    """Add a learned prior over local geometry, a visibility prior and sight lines to the loss of any radiance field.
 
     Args:
         denoiser: from :func:`unghost.load_denoiser`; None loads the shipped default through onnxruntime.
@@ -25,6 +26,8 @@ class DensityRegularizer(RequiredDenoiserRegularizer):
         cameras: of the training photos; None switches the visibility loss off.
         depth_maps: ``(cameras, height, width)`` of the photos, along the optical axis, inf for nothing: the visibility
             loss then counts only cameras from which nothing hides a point.
+        points: sparse points of the training photos, in the frame of ``cameras``; None switches the sight-line loss
+            off.
         field_pitch: side of the field's own cells, scene units, or a function of cube centres ``(N, 3)`` that returns
             it as ``(N,)`` (a contracted field); None uses the cube's voxel.
         device: where positions are created; None for the device of the field's parameters, else the CPU.
@@ -45,7 +48,7 @@ class DensityRegularizer(RequiredDenoiserRegularizer):
         >>> regularizer = unghost.DensityRegularizer(aabb=[[-1, -1, -1], [1, 1, 1]], field_pitch=1 / 32, cubes=2)
         >>> losses = regularizer(field)
         >>> sorted(losses)
-        ['dsds', 'visibility']
+        ['dsds', 'sight_lines', 'visibility']
         >>> sum(losses.values()).backward()
         >>> bool(field[0].weight.grad.abs().sum() > 0)
         True
@@ -58,6 +61,7 @@ class DensityRegularizer(RequiredDenoiserRegularizer):
         aabb: ArrayLike,
         cameras: Cameras | None = None,
         depth_maps: NDArray[np.floating] | None = None,
+        points: SparsePoints | None = None,
         field_pitch: FieldPitch = None,
         device: Any = None,
         cubes: int | None = None,
@@ -80,6 +84,7 @@ class DensityRegularizer(RequiredDenoiserRegularizer):
             aabb=aabb,
             cameras=cameras,
             depth_maps=depth_maps,
+            points=points,
             field_pitch=field_pitch,
             device=device,
             settings=dataclasses.replace(settings or RegularizerSettings(), **changes),

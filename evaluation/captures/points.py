@@ -1,0 +1,188 @@
+"""Sparse points of a COLMAP model, with their tracks, as :class:`~unghost.core.sparse_points.SparsePoints`.
+
+``points3D`` files are parsed here, with every length checked: pycolmap (3.12) ends the process on one that is cut
+short.
+"""
+
+from __future__ import annotations
+
+import shutil
+import struct
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core.cameras import Cameras
+from ...core.errors import InvalidFile, MissingFile
+from ...core.sparse_points import SparsePoints
+from .colmap import quiet_pycolmap
+
+HEAD = struct.Struct("<Q3d3BdQ")  # id, xyz, rgb, error, length of the track
+TRACK_ENTRY = np.dtype([("image", "<u4"), ("keypoint", "<u4")])
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """What a ``points3D`` file holds.
+
+    Attributes:
+        xyz: ``(P, 3)`` in the model's world.
+        error: ``(P,)`` mean reprojection error, pixels.
+        point: ``(M,)`` index into ``xyz``.
+        image: ``(M,)`` COLMAP's image id.
+    """
+
+    xyz: NDArray[np.float64]
+    error: NDArray[np.float64]
+    point: NDArray[np.int64]
+    image: NDArray[np.int64]
+
+
+def read_tracks(path: str | Path) -> Tracks:
+    """Read COLMAP's ``points3D.bin`` or ``points3D.txt``.
+
+    Raises:
+        MissingFile: there is no such file.
+        InvalidFile: it is cut short, has bytes left over, or holds what is no point.
+
+    Example:
+        >>> path = Path(tempfile.mkdtemp(), "points3D.txt")
+        >>> _ = path.write_text("# a comment\\n7 0.5 0 2 255 0 0 0.3 1 12 4 9\\n")
+        >>> tracks = read_tracks(path)
+        >>> tracks.xyz.tolist(), tracks.image.tolist()
+        ([[0.5, 0.0, 2.0]], [1, 4])
+    """
+    file = Path(path)
+    if not file.is_file():
+        raise MissingFile(f"read_tracks: no file {file}")
+    xyz, errors, images = _binary(file) if file.suffix == ".bin" else _text(file)
+    places = np.array(xyz, dtype=np.float64).reshape(-1, 3)
+    if not np.isfinite(places).all():
+        raise InvalidFile(f"read_tracks: {file} has points whose coordinates are not finite")
+    error = np.array(errors, dtype=np.float64)
+    point = np.repeat(np.arange(len(places)), [len(track) for track in images])
+    image = np.concatenate([np.zeros(0, np.int64), *images]).astype(np.int64)
+    return Tracks(places, np.where(error >= 0, error, np.nan), point, image)  # COLMAP writes -1 for unknown
+
+
+def _binary(file: Path) -> tuple[list[tuple[float, ...]], list[float], list[NDArray[np.int64]]]:
+    data = file.read_bytes()
+    xyz: list[tuple[float, ...]] = []
+    errors: list[float] = []
+    images: list[NDArray[np.int64]] = []
+    at = 8
+    if len(data) < at:
+        raise InvalidFile(f"read_tracks: {file} is cut short, {len(data)} bytes")
+    (count,) = struct.unpack_from("<Q", data)
+    if count * HEAD.size > len(data):
+        raise InvalidFile(f"read_tracks: {file} names {count} points, more than its {len(data)} bytes can hold")
+    for number in range(count):
+        if at + HEAD.size > len(data):
+            raise InvalidFile(f"read_tracks: {file} is cut short in point {number} of {count}")
+        _, x, y, z, _, _, _, error, length = HEAD.unpack_from(data, at)
+        at += HEAD.size
+        if length * TRACK_ENTRY.itemsize > len(data) - at:
+            raise InvalidFile(f"read_tracks: {file} is cut short in the track of point {number} of {count}")
+        images.append(np.frombuffer(data, TRACK_ENTRY, length, at)["image"].astype(np.int64))
+        at += length * TRACK_ENTRY.itemsize
+        xyz.append((x, y, z))
+        errors.append(error)
+    if at != len(data):
+        raise InvalidFile(f"read_tracks: {file} has {len(data) - at} bytes after its {count} points")
+    return xyz, errors, images
+
+
+def _text(file: Path) -> tuple[list[tuple[float, ...]], list[float], list[NDArray[np.int64]]]:
+    xyz, errors, images = [], [], []
+    with file.open(encoding="utf-8-sig") as stream:
+        for number, line in enumerate(stream, 1):
+            words = line.split()
+            if not words or words[0].startswith("#"):
+                continue
+            if len(words) < 8 or len(words) % 2:
+                raise InvalidFile(
+                    f"read_tracks: line {number} of {file} must be ID X Y Z R G B ERROR and pairs of numbers, "
+                    f"got {len(words)} words"
+                )
+            try:
+                xyz.append(tuple(float(word) for word in words[1:4]))
+                errors.append(float(words[7]))
+                images.append(np.array([int(word) for word in words[8::2]], dtype=np.int64))
+            except ValueError:
+                raise InvalidFile(f"read_tracks: line {number} of {file} holds what is no number") from None
+    return xyz, errors, images
+
+
+def image_names(model: str | Path) -> dict[int, str]:
+    """Photo name of every image id of a COLMAP model.
+
+    Raises:
+        MissingExtra: pycolmap is missing.
+        InvalidFile: the model cannot be read.
+    """
+    source = Path(model)
+    ending = ".bin" if (source / "images.bin").is_file() else ".txt"
+    with quiet_pycolmap("image_names") as pycolmap, tempfile.TemporaryDirectory() as scratch:
+        try:
+            for name in ("cameras", "images"):
+                shutil.copyfile(source / f"{name}{ending}", Path(scratch, f"{name}{ending}"))
+            Path(scratch, f"points3D{ending}").write_bytes(bytes(8) if ending == ".bin" else b"")
+            reconstruction = pycolmap.Reconstruction(scratch)
+        except Exception as error:
+            reason = str(error).replace(scratch, str(source)).splitlines()[0]
+            raise InvalidFile(f"image_names: {source} is no COLMAP model that can be read ({reason})") from None
+    return {int(number): str(image.name) for number, image in reconstruction.images.items()}
+
+
+def read_points(
+    model: str | Path, names: Sequence[str], cameras: Cameras, *, transform: NDArray[np.float64] | None = None
+) -> SparsePoints:
+    """Read the sparse points of a COLMAP model and who observed them.
+
+    Args:
+        model: folder with ``cameras``, ``images`` and ``points3D``, ``.bin`` or ``.txt``.
+        names: of the photos of ``cameras``, in their order; a photo is found by its name in the model, or by a name
+            that ends with it (``images/a.jpg`` for ``a.jpg``). Observations by other photos of the model are left out.
+        cameras: in the frame of the result.
+        transform: ``(4, 4)`` from the model's world to that of ``cameras``, a similarity without rotation
+            (``Capture.transform``); None if they are one.
+
+    Returns:
+        All points of the model, in its order; some may be left without observations.
+
+    Raises:
+        InvalidFile: a file is broken, or a track names an image that the model does not have.
+    """
+    source = Path(model)
+    file = source / "points3D.bin"
+    tracks = read_tracks(file if file.is_file() else source / "points3D.txt")
+    known = image_names(source)
+    index_of = _positions(known, names)
+    unknown = sorted(set(np.unique(tracks.image).tolist()) - set(known))
+    if unknown:
+        raise InvalidFile(
+            f"read_points: tracks of {source} name {len(unknown)} images that it lacks, first {unknown[0]}"
+        )
+    table = np.full(max(known, default=0) + 1, -1)
+    for number, position in index_of.items():
+        table[number] = position
+    camera = table[tracks.image] if len(tracks.image) else np.zeros(0, dtype=np.int64)
+    xyz = tracks.xyz if transform is None else tracks.xyz @ transform[:3, :3].T + transform[:3, 3]
+    used = camera >= 0
+    return SparsePoints.create(xyz, point=tracks.point[used], camera=camera[used], cameras=cameras, error=tracks.error)
+
+
+def _positions(known: dict[int, str], names: Sequence[str]) -> dict[int, int]:
+    """Image id -> position in ``names``."""
+    whole = {name: position for position, name in enumerate(names)}
+    tails: dict[str, int] = {}
+    for position, name in enumerate(names):
+        for depth in range(1, name.count("/") + 1):
+            tail = name.split("/", depth)[-1]
+            tails[tail] = -1 if tail in tails else position  # two photos of one name in two folders: neither
+    found = {number: whole.get(name, tails.get(name, -1)) for number, name in known.items()}
+    return {number: position for number, position in found.items() if position >= 0}

@@ -1,0 +1,130 @@
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from unghost.core.cameras import Cameras, look_at
+from unghost.evaluation.captures.points import read_points, read_tracks
+
+CAPTURES = Path(__file__).resolve().parents[4] / "shared" / "data" / "captures"
+
+
+def binary(points):
+    """``points3D.bin`` by its published layout: (id, xyz, error, [(image, keypoint)])."""
+    data = struct.pack("<Q", len(points))
+    for number, xyz, error, track in points:
+        data += struct.pack("<Q3d3BdQ", number, *xyz, 9, 9, 9, error, len(track))
+        data += b"".join(struct.pack("<II", *entry) for entry in track)
+    return data
+
+
+POINTS = [(7, (0.0, 0.5, -1.0), 0.4, [(3, 0), (1, 12)]), (2, (1.0, 0.0, 0.0), -1.0, [(3, 1), (3, 2), (9, 4)])]
+TEXT = "# points\n7 0 .5 -1 9 9 9 .4 3 0 1 12\n\n2 1 0 0 9 9 9 -1 3 1 3 2 9 4\n"
+
+
+@pytest.mark.parametrize("name", ["points3D.bin", "points3D.txt"])
+def test_both_formats_say_the_same(tmp_path, name):
+    file = tmp_path / name
+    file.write_bytes(binary(POINTS) if name.endswith(".bin") else b"\xef\xbb\xbf" + TEXT.replace("\n", "\r\n").encode())
+    tracks = read_tracks(file)
+    assert tracks.xyz.tolist() == [[0.0, 0.5, -1.0], [1.0, 0.0, 0.0]]
+    assert tracks.error[0] == 0.4
+    assert np.isnan(tracks.error[1])  # COLMAP's -1
+    assert tracks.point.tolist() == [0, 0, 1, 1, 1]
+    assert tracks.image.tolist() == [3, 1, 3, 3, 9]
+
+
+def test_a_file_that_is_cut_anywhere_is_refused(tmp_path):
+    data, file = binary(POINTS), tmp_path / "points3D.bin"
+    for length in range(len(data)):
+        file.write_bytes(data[:length])
+        with pytest.raises(ValueError, match=r"cut short|more than its"):
+            read_tracks(file)
+    file.write_bytes(data + b"\0")
+    with pytest.raises(ValueError, match="1 bytes after its 2 points"):
+        read_tracks(file)
+    file.write_bytes(struct.pack("<Q", 1 << 60))
+    with pytest.raises(ValueError, match="more than its 8 bytes can hold"):
+        read_tracks(file)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("1 0 0 0 9 9 9\n", "line 1 of .* got 7 words"),
+        ("1 0 0 0 9 9 9 .4 3\n", "got 9 words"),
+        ("1 0 0 zero 9 9 9 .4\n", "holds what is no number"),
+        ("1 0 0 nan 9 9 9 .4\n", "not finite"),
+        ("1 0 0 0 9 9 9 .4 3.5 1\n", "holds what is no number"),
+    ],
+)
+def test_text_that_is_no_point_is_refused(tmp_path, text, message):
+    (tmp_path / "points3D.txt").write_text(text, encoding="utf-8")
+    with pytest.raises(ValueError, match=message):
+        read_tracks(tmp_path / "points3D.txt")
+
+
+def test_no_file_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no file"):
+        read_tracks(tmp_path / "points3D.bin")
+
+
+@pytest.fixture
+def model(tmp_path):
+    """A text model of three photos, one in a folder and with a space in its name."""
+    pytest.importorskip("pycolmap")
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 100 80 90 90 50 40\n", encoding="utf-8")
+    rows = [(1, "b.jpg"), (3, "walk/a.jpg"), (9, "c.jpg")]
+    lines = "".join(f"{number} 1 0 0 0 0 0 {number} 1 {name}\n\n" for number, name in rows)
+    (tmp_path / "images.txt").write_text(lines, encoding="utf-8")
+    (tmp_path / "points3D.txt").write_text(TEXT, encoding="utf-8")
+    return tmp_path
+
+
+def cameras(count):
+    origins = np.stack([np.full(count, 3.0), np.arange(count), np.zeros(count)], axis=1)
+    return Cameras.create(look_at(origins, np.zeros((count, 3))), np.array([90.0, 90.0, 50.0, 40.0]), 100, 80)
+
+
+def test_photos_are_found_by_name_and_others_are_left_out(model):
+    points = read_points(model, ["images/walk/a.jpg", "images/b.jpg"], cameras(2))
+    assert len(points) == 2
+    assert points.point.tolist() == [0, 0, 1]
+    assert points.camera.tolist() == [0, 1, 0]  # the photo c.jpg is not asked for; a repeated observation counts once
+    assert np.isfinite(points.uncertainty[0])
+    assert points.uncertainty[1] == np.inf
+
+
+def test_the_transform_of_a_capture_is_applied(model):
+    transform = np.diag([2.0, 2.0, 2.0, 1.0])
+    transform[:3, 3] = [1.0, 0.0, -1.0]
+    moved = read_points(model, ["b.jpg"], cameras(1), transform=transform)
+    assert moved.xyz.tolist() == [[1.0, 1.0, -3.0], [3.0, 0.0, -1.0]]
+
+
+def test_two_photos_of_one_name_are_told_apart_or_not_used(model):
+    points = read_points(model, ["x/b.jpg", "y/b.jpg", "walk/a.jpg"], cameras(3))
+    assert sorted(set(points.camera.tolist())) == [2]
+
+
+def test_a_track_of_an_unknown_image_is_refused(model):
+    (model / "points3D.txt").write_text("1 0 0 0 9 9 9 .4 77 0\n", encoding="utf-8")
+    with pytest.raises(ValueError, match="name 1 images that it lacks, first 77"):
+        read_points(model, ["b.jpg"], cameras(1))
+
+
+@pytest.mark.shared_data
+@pytest.mark.skipif(not CAPTURES.is_dir(), reason="no shared data")
+@pytest.mark.parametrize("name", ["snowmiku_plush", "skull_flash"])
+def test_real_points_project_into_the_photos_that_observed_them(name):
+    pycolmap = pytest.importorskip("pycolmap")
+    from unghost.evaluation.captures.loading import load_capture
+
+    capture = load_capture(CAPTURES / name)
+    folder = CAPTURES / name / "sparse" / "0"
+    points = read_points(folder, capture.names, capture.cameras, transform=capture.transform)
+    assert points.share_in_view(capture.cameras) > 0.999
+    model = pycolmap.Reconstruction(folder)
+    assert len(points) == len(model.points3D)
+    assert len(read_tracks(folder / "points3D.bin").point) == model.compute_num_observations()
