@@ -219,7 +219,7 @@ def timestep(step: int, dtype: torch.dtype) -> float:
 
 def nothing() -> None:
     losses = build(None, cubes=0, visibility_samples=0, cameras=cameras())(smooth)
-    assert [loss.item() for loss in losses.values()] == [0.0, 0.0]
+    assert not any(loss.item() for loss in losses.values())
     empty = torch.zeros(0, 1, 32, 32, 32)
     assert stable_mean(dsds_loss(empty, empty, target_density=1.0)).item() == 0.0
 
