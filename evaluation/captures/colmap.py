@@ -113,6 +113,31 @@ def read_model(folder: str | Path, *, prefix: str = "") -> dict[str, Any]:
             RADIAL_FISHEYE or OPENCV_FISHEYE.
     """
     source = Path(folder)
+    model, photos = _opened(source)
+    photos = sorted((pair for pair in photos if pair[1].has_pose), key=lambda pair: pair[0])
+    if not photos:
+        raise InvalidFile(f"read_model: {source} has no photo with a pose")
+    used = {photo.camera_id for _, photo in photos}
+    lenses = {number: lens_of(camera, source) for number, camera in model.cameras.items() if number in used}
+    frames = []
+    for name, photo in photos:
+        pose = photo.cam_from_world().inverse().matrix() * np.array([1.0, -1.0, -1.0, 1.0])
+        frames.append({"file_path": prefix + name, **lenses[photo.camera_id], "transform_matrix": pose.tolist()})
+    return {"frames": frames}
+
+
+def image_names(folder: str | Path) -> dict[int, str]:
+    """Photo name of every image id of a sparse model.
+
+    Raises:
+        ImportError: pycolmap is missing.
+        ValueError: no model, or a broken one.
+    """
+    return {int(image.image_id): str(name) for name, image in _opened(Path(folder))[1]}
+
+
+def _opened(source: Path) -> tuple[Any, list[tuple[str, Any]]]:
+    """A ``pycolmap.Reconstruction`` without points, and its images with their names."""
     ending = _ending(source)
     if ending is None:
         raise InvalidFile(f"read_model: {source} has no cameras and images, .bin or .txt: not a COLMAP model")
@@ -130,19 +155,7 @@ def read_model(folder: str | Path, *, prefix: str = "") -> dict[str, Any]:
         except Exception as error:  # whatever the library makes of bad bytes
             reason = str(error).replace(scratch, str(source)).splitlines()[0]
             raise InvalidFile(f"read_model: {source} is no COLMAP model that can be read ({reason})") from None
-    posed = [
-        (each.name if names is None else names[each.name], each) for each in model.images.values() if each.has_pose
-    ]
-    photos = sorted(posed, key=lambda pair: pair[0])
-    if not photos:
-        raise InvalidFile(f"read_model: {source} has no photo with a pose")
-    used = {photo.camera_id for _, photo in photos}
-    lenses = {number: lens_of(camera, source) for number, camera in model.cameras.items() if number in used}
-    frames = []
-    for name, photo in photos:
-        pose = photo.cam_from_world().inverse().matrix() * np.array([1.0, -1.0, -1.0, 1.0])
-        frames.append({"file_path": prefix + name, **lenses[photo.camera_id], "transform_matrix": pose.tolist()})
-    return {"frames": frames}
+    return model, [(each.name if names is None else names[each.name], each) for each in model.images.values()]
 
 
 def _rename(source: Path, target: Path) -> dict[str, str]:

@@ -83,19 +83,42 @@ def into_the_trained_world(
         colmap: the poses are COLMAP's own.
     """
     motion, factor = read_dataparser(dataparser)
-    applied, scaled = meta.get("applied_transform"), meta.get("applied_scale", 1.0)
+    rigid, scale = _applied(meta, folder, colmap=colmap)
+    motion = motion @ np.linalg.inv(rigid)
+    moved = motion[:3] @ np.concatenate([poses, np.tile([[[0.0, 0.0, 0.0, 1.0]]], (len(poses), 1, 1))], axis=1)
+    moved[:, :, 3] *= factor / scale
+    return np.asarray(moved)
+
+
+def applied_motion(meta: Mapping[str, Any], folder: Path) -> NDArray[np.float64]:
+    """The similarity ``(4, 4)`` from COLMAP's world to that of the ``transforms.json`` beside it.
+
+    Args:
+        meta: the object of ``transforms.json``; empty if the poses are COLMAP's own.
+        folder: of the capture.
+
+    Raises:
+        ValueError: an ``applied_transform`` that is no rigid motion, an ``applied_scale`` that is not > 0.
+
+    Example:
+        >>> applied_motion({"applied_scale": 2.0}, Path("capture")).diagonal().tolist()
+        [2.0, 2.0, 2.0, 1.0]
+    """
+    rigid, scale = _applied(meta, folder, colmap=not meta)
+    return np.diag([scale, scale, scale, 1.0]) @ rigid
+
+
+def _applied(meta: Mapping[str, Any], folder: Path, *, colmap: bool) -> tuple[NDArray[np.float64], float]:
+    applied, before = meta.get("applied_transform"), np.eye(4)
     if applied is None and not colmap and (folder / "colmap" / "sparse" / "0").exists():
         applied = EARLIER
     if applied is not None:
-        before = np.eye(4)
         try:
             before[:3] = np.array(applied, dtype=np.float64)[:3]
         except (TypeError, ValueError):
             raise InvalidFile(f"load_cameras: applied_transform in {folder} must hold 3 x 4 numbers") from None
-        motion = motion @ np.linalg.inv(_rigid(before, "applied_transform", folder))
-    moved = motion[:3] @ np.concatenate([poses, np.tile([[[0.0, 0.0, 0.0, 1.0]]], (len(poses), 1, 1))], axis=1)
-    moved[:, :, 3] *= factor / _positive(scaled, "applied_scale", folder)
-    return np.asarray(moved)
+        before = _rigid(before, "applied_transform", folder)
+    return before, _positive(meta.get("applied_scale", 1.0), "applied_scale", folder)
 
 
 def _rigid(motion: NDArray[np.float64], key: str, where: str | Path) -> NDArray[np.float64]:

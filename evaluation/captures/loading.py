@@ -6,6 +6,7 @@ OpenGL camera-to-world matrices, OPENCV or OPENCV_FISHEYE lenses, one for all ph
 
 from __future__ import annotations
 
+import functools
 import re
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
@@ -19,11 +20,13 @@ from numpy.typing import NDArray
 from ...core.cameras import Cameras
 from ...core.errors import InvalidArgument, InvalidFile, MissingFile
 from ...core.io import read_json
+from ...core.sparse_points import SparsePoints, warn_if_not_in_view
 from .colmap import find_model, read_model
-from .dataparser import find_dataparser, into_the_trained_world, warn_if_exported
+from .dataparser import applied_motion, find_dataparser, into_the_trained_world, warn_if_exported
 from .inria import FILE as INRIA_FILE
 from .inria import cameras_as_frames
 from .photos import RESIZED, find_photos, fit_frames, photo_sizes, read_photo, report_missing
+from .points import read_points
 from .splits import Splits, resolve_splits
 from .transforms import has_split_files, read_frames, read_lens, read_object, read_split_files
 
@@ -73,6 +76,26 @@ class Capture:
     def paths(self) -> tuple[Path, ...]:
         """Where each photo is."""
         return self._paths
+
+    @functools.cached_property
+    def points(self) -> SparsePoints:
+        """Sparse points of the capture's COLMAP model, in the frame of ``cameras``; read when first asked for.
+
+        Beside a ``transforms.json`` the model is the one in ``sparse/0`` (or ``colmap/sparse/0``), moved by the file's
+        ``applied_transform`` and ``applied_scale``. Its points were adjusted with all photos, those of the evaluation
+        too: for anything that is scored, triangulate from the training photos alone.
+
+        Raises:
+            FileNotFoundError: there is no model, or it has no points.
+            ValueError: a broken model.
+        """
+        model = find_model(self.folder)
+        if model is None:
+            raise MissingFile(f"Capture.points: {self.folder} has no COLMAP model (sparse/0) with points3D")
+        moved = self.transform @ applied_motion(self.meta, self.folder)
+        points = read_points(model, self.names, self.cameras, transform=moved)
+        warn_if_not_in_view(points, self.cameras, caller="Capture.points")
+        return points
 
     def photo_size(self, index: int) -> tuple[int, int]:
         """Width and height of a photo as it is read: stored, or upright."""

@@ -6,9 +6,7 @@ short.
 
 from __future__ import annotations
 
-import shutil
 import struct
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +17,7 @@ from numpy.typing import NDArray
 from ...core.cameras import Cameras
 from ...core.errors import InvalidFile, MissingFile
 from ...core.sparse_points import SparsePoints
-from .colmap import quiet_pycolmap
+from .colmap import image_names
 
 HEAD = struct.Struct("<Q3d3BdQ")  # id, xyz, rgb, error, length of the track
 TRACK_ENTRY = np.dtype([("image", "<u4"), ("keypoint", "<u4")])
@@ -50,6 +48,7 @@ def read_tracks(path: str | Path) -> Tracks:
         InvalidFile: it is cut short, has bytes left over, or holds what is no point.
 
     Example:
+        >>> import tempfile
         >>> path = Path(tempfile.mkdtemp(), "points3D.txt")
         >>> _ = path.write_text("# a comment\\n7 0.5 0 2 255 0 0 0.3 1 12 4 9\\n")
         >>> tracks = read_tracks(path)
@@ -115,27 +114,6 @@ def _text(file: Path) -> tuple[list[tuple[float, ...]], list[float], list[NDArra
             except ValueError:
                 raise InvalidFile(f"read_tracks: line {number} of {file} holds what is no number") from None
     return xyz, errors, images
-
-
-def image_names(model: str | Path) -> dict[int, str]:
-    """Photo name of every image id of a COLMAP model.
-
-    Raises:
-        MissingExtra: pycolmap is missing.
-        InvalidFile: the model cannot be read.
-    """
-    source = Path(model)
-    ending = ".bin" if (source / "images.bin").is_file() else ".txt"
-    with quiet_pycolmap("image_names") as pycolmap, tempfile.TemporaryDirectory() as scratch:
-        try:
-            for name in ("cameras", "images"):
-                shutil.copyfile(source / f"{name}{ending}", Path(scratch, f"{name}{ending}"))
-            Path(scratch, f"points3D{ending}").write_bytes(bytes(8) if ending == ".bin" else b"")
-            reconstruction = pycolmap.Reconstruction(scratch)
-        except Exception as error:
-            reason = str(error).replace(scratch, str(source)).splitlines()[0]
-            raise InvalidFile(f"image_names: {source} is no COLMAP model that can be read ({reason})") from None
-    return {int(number): str(image.name) for number, image in reconstruction.images.items()}
 
 
 def read_points(

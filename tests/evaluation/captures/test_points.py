@@ -1,10 +1,13 @@
+import json
 import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from unghost.core.cameras import Cameras, look_at
+from unghost.evaluation.captures.loading import load_capture
 from unghost.evaluation.captures.points import read_points, read_tracks
 
 CAPTURES = Path(__file__).resolve().parents[4] / "shared" / "data" / "captures"
@@ -119,7 +122,6 @@ def test_a_track_of_an_unknown_image_is_refused(model):
 @pytest.mark.parametrize("name", ["snowmiku_plush", "skull_flash"])
 def test_real_points_project_into_the_photos_that_observed_them(name):
     pycolmap = pytest.importorskip("pycolmap")
-    from unghost.evaluation.captures.loading import load_capture
 
     capture = load_capture(CAPTURES / name)
     folder = CAPTURES / name / "sparse" / "0"
@@ -128,3 +130,62 @@ def test_real_points_project_into_the_photos_that_observed_them(name):
     model = pycolmap.Reconstruction(folder)
     assert len(points) == len(model.points3D)
     assert len(read_tracks(folder / "points3D.bin").point) == model.compute_num_observations()
+
+
+@pytest.fixture
+def capture_folder(tmp_path):
+    """A COLMAP model of two photos that look along +Z at points before them, and the photos."""
+    pytest.importorskip("pycolmap")
+    model = tmp_path / "sparse" / "0"
+    model.mkdir(parents=True)
+    (tmp_path / "images").mkdir()
+    (model / "cameras.txt").write_text("1 PINHOLE 32 24 30 30 16 12\n", encoding="utf-8")
+    rows = ["1 1 0 0 0 0 0 0 1 a b.png\n\n", "2 1 0 0 0 -0.5 0 0 1 c.png\n\n"]  # the second camera is at x = .5
+    (model / "images.txt").write_text("".join(rows), encoding="utf-8")
+    (model / "points3D.txt").write_text("5 0 0 4 9 9 9 .5 1 0 2 0\n6 0.2 0.1 5 9 9 9 .5 1 1\n", encoding="utf-8")
+    for name in ("a b.png", "c.png"):
+        Image.new("RGB", (32, 24)).save(tmp_path / "images" / name)
+    return tmp_path
+
+
+def test_a_capture_has_the_points_of_its_model(capture_folder):
+    capture = load_capture(capture_folder, downscale=2, normalize=True)
+    points = capture.points
+    assert points.xyz[0].tolist() == (capture.transform @ [0, 0, 4, 1])[:3].tolist()
+    assert points.views().tolist() == [2, 1]
+    assert points.share_in_view(capture.cameras) == 1.0
+    assert points is capture.points
+
+
+def test_beside_transforms_json_they_are_moved_with_it(capture_folder):
+    from unghost.evaluation.captures.transforms import write_transforms
+
+    plain = load_capture(capture_folder, downscale=1, normalize=False)
+    turn = np.array([[0.0, 1, 0, 3], [1, 0, 0, 0], [0, 0, -1, 1]])
+    poses = turn[:, :3] @ plain.cameras.camera_to_world
+    poses[:, :, 3] = 2 * (poses[:, :, 3] + turn[:, 3])
+    moved = Cameras.create(poses, plain.cameras.intrinsics, 32, 24)
+    extra = {"applied_transform": turn.tolist(), "applied_scale": 2.0}
+    write_transforms(capture_folder / "transforms.json", moved, plain.names, {}, **extra)
+    capture = load_capture(capture_folder, downscale=1, normalize=False)
+    np.testing.assert_allclose(capture.points.xyz[0], 2 * (turn @ [0, 0, 4, 1]))
+    assert capture.points.share_in_view(capture.cameras) == 1.0
+    meta = json.loads((capture_folder / "transforms.json").read_text())
+    del meta["applied_transform"]
+    (capture_folder / "transforms.json").write_text(json.dumps(meta))
+    with pytest.warns(UserWarning, match=r"Capture.points: only 0% of the observations project"):
+        _ = load_capture(capture_folder, downscale=1, normalize=False).points
+
+
+def test_without_a_model_or_its_points_the_error_says_what_is_wanted(capture_folder):
+    (capture_folder / "sparse" / "0" / "points3D.txt").unlink()
+    with pytest.raises(FileNotFoundError, match=r"no file .*points3D"):
+        _ = load_capture(capture_folder).points
+    other = capture_folder / "other"
+    other.mkdir()
+    Image.new("RGB", (32, 24)).save(other / "a.png")
+    frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}
+    lens = {"w": 32, "h": 24, "fl_x": 30, "fl_y": 30, "cx": 16, "cy": 12}
+    (other / "transforms.json").write_text(json.dumps({**lens, "frames": [frame]}))
+    with pytest.raises(FileNotFoundError, match=r"has no COLMAP model \(sparse/0\) with points3D"):
+        _ = load_capture(other).points
