@@ -25,6 +25,7 @@ LENSES = {  # COLMAP's camera models -> their parameters in order, by the names 
     "RADIAL_FISHEYE": ("fl_x", "cx", "cy", "k1", "k2"),
     "OPENCV_FISHEYE": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4"),
 }
+OWN = "unghost"  # begins the names of models that hold triangulated points only (``unghost points``)
 PLACES = ("", "sparse", "colmap/sparse")  # where a model may be below the folder of a capture
 
 
@@ -83,7 +84,8 @@ def find_model(folder: Path) -> Path | None:
     for place in PLACES:
         if _ending(folder / place):
             return folder / place
-        parts = [path for path in sorted((folder / place).glob("*")) if place and _ending(path)]
+        within = sorted((folder / place).glob("*")) if place else []
+        parts = [path for path in within if _ending(path) and not path.name.startswith(OWN)]
         if len(parts) > 1:
             counts = [len(read_model(part)["frames"]) for part in parts]
             told = ", ".join(f"{part.name}: {count} photos" for part, count in zip(parts, counts))

@@ -21,12 +21,12 @@ from ...core.cameras import Cameras
 from ...core.errors import InvalidArgument, InvalidFile, MissingFile
 from ...core.io import read_json
 from ...core.sparse_points import SparsePoints, warn_if_not_in_view
-from .colmap import find_model, read_model
+from .colmap import find_model, image_names, read_model
 from .dataparser import applied_motion, find_dataparser, into_the_trained_world, warn_if_exported
 from .inria import FILE as INRIA_FILE
 from .inria import cameras_as_frames
 from .photos import RESIZED, find_photos, fit_frames, photo_sizes, read_photo, report_missing
-from .points import read_points
+from .points import points_folder, read_points
 from .splits import Splits, resolve_splits
 from .transforms import has_split_files, read_frames, read_lens, read_object, read_split_files
 
@@ -96,6 +96,28 @@ class Capture:
         points = read_points(model, self.names, self.cameras, transform=moved)
         warn_if_not_in_view(points, self.cameras, caller="Capture.points")
         return points
+
+    def points_of(self, split: str) -> SparsePoints:
+        """Sparse points triangulated from the photos of one sweep alone, as ``unghost points`` has stored them.
+
+        Returns:
+            Points in the frame of ``cameras``; their ``camera`` counts positions in ``split(split)``.
+
+        Raises:
+            FileNotFoundError: ``unghost points`` has not been run for this sweep.
+            ValueError: no such sweep, a broken model, or one of other photos than the sweep's.
+        """
+        chosen, model = self.split(split), points_folder(self.folder, split)
+        if not model.is_dir():
+            raise MissingFile(
+                f"Capture.points_of: {self.folder} has no points of the photos of {split!r} alone: run "
+                f"unghost points {self.folder} --photos-of {split}"
+            )
+        names = [self.names[index] for index in chosen]
+        others = sorted(set(image_names(model).values()) - set(names))
+        if others:
+            raise InvalidFile(f"Capture.points_of: {model} holds photos that are not in {split!r}, such as {others[0]}")
+        return read_points(model, names, self.cameras.select(chosen), transform=self.transform)
 
     def photo_size(self, index: int) -> tuple[int, int]:
         """Width and height of a photo as it is read: stored, or upright."""

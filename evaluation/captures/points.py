@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ...core.cameras import Cameras
 from ...core.errors import InvalidFile, MissingFile
 from ...core.sparse_points import SparsePoints
-from .colmap import image_names
+from .colmap import OWN, image_names
 
 HEAD = struct.Struct("<Q3d3BdQ")  # id, xyz, rgb, error, length of the track
 TRACK_ENTRY = np.dtype([("image", "<u4"), ("keypoint", "<u4")])
@@ -114,6 +114,16 @@ def _text(file: Path) -> tuple[list[tuple[float, ...]], list[float], list[NDArra
             except ValueError:
                 raise InvalidFile(f"read_tracks: line {number} of {file} holds what is no number") from None
     return xyz, errors, images
+
+
+def points_folder(folder: str | Path, split: str) -> Path:
+    """Where ``unghost points`` stores the points of one sweep of a capture.
+
+    Example:
+        >>> points_folder("room", "train").as_posix()
+        'room/sparse/unghost-train'
+    """
+    return Path(folder) / "sparse" / f"{OWN}-{split}"
 
 
 def read_points(

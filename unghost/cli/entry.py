@@ -40,6 +40,10 @@ VERBS = {
         "captures",
         "Say how hard a capture's evaluation is and, with --out, write it as stock nerfstudio reads it.",
     ),
+    "points": (
+        "captures",
+        "Triangulate sparse points from the photos of one sweep alone, with the poses that the capture has.",
+    ),
     "evaluate": (
         "evaluation",
         "Score anyone's renders against photos: a page, a results file, a table. No field is needed.",

@@ -1,0 +1,231 @@
+"""Triangulate sparse points from chosen photos of a capture alone, with the poses that the capture has (pycolmap)."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Callable, Sequence
+from itertools import combinations
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ...core.errors import InvalidArgument
+from ...core.io import new_folder
+from ...core.sparse_points import SparsePoints
+from .colmap import quiet_pycolmap
+from .photos import read_photo
+from .points import read_points
+
+if TYPE_CHECKING:
+    from .loading import Capture
+
+Progress = Callable[[str, int, int], None]
+PLAIN = (".jpg", ".jpeg", ".png")  # COLMAP reads these from disk; others are decoded first
+MATCH_AT_ONCE = 200
+LONGEST_SIDE = 1600
+TO_COLMAP = np.diag([1.0, -1.0, -1.0])  # OpenGL's camera axes to COLMAP's
+
+
+def triangulate(
+    capture: Capture,
+    indices: ArrayLike,
+    *,
+    out: str | Path | None = None,
+    longest_side: int = LONGEST_SIDE,
+    seed: int = 0,
+    threads: int = 0,
+    progress: Progress | None = None,
+) -> SparsePoints:
+    """Triangulate points from the pixels of some photos alone, with known poses and lenses: SIFT, every pair matched.
+
+    No other photo, keypoint or pose is read, so points for training hold nothing of an evaluation sweep (its photos may
+    have helped to find the poses: that is part of the protocol).
+
+    Args:
+        capture: from ``load_capture``, at any ``downscale``: photos are read at their own size.
+        indices: ``(n,)`` unique positions of at least two photos, such as ``capture.split("train")``.
+        out: new folder for the COLMAP model, in the world of the capture's file; None for none.
+        longest_side: features are looked for in photos shrunk to this many pixels. Smaller is faster.
+        seed: of COLMAP's random choices.
+        threads: 0 for one per core.
+        progress: called with a stage (``features``, ``pairs``, ``points``), how much is done, and how much there is.
+
+    Returns:
+        Points in the frame of ``capture.cameras``; ``camera`` counts positions in ``indices``.
+
+    Raises:
+        ImportError: pycolmap is missing.
+        ValueError: fewer than two photos, an index twice or out of range, ``out`` is there already, nothing matches.
+    """
+    chosen = np.asarray(indices, dtype=np.int64)
+    if chosen.ndim != 1 or len(chosen) < 2 or len(set(chosen.tolist())) < len(chosen):
+        raise InvalidArgument(f"triangulate: indices must name two different photos or more, got {chosen.tolist()}")
+    if chosen.min() < 0 or chosen.max() >= len(capture):
+        raise InvalidArgument(f"triangulate: indices must lie in [0, {len(capture)}), got {chosen.tolist()}")
+    tell = progress or (lambda stage, done, total: None)
+    with quiet_pycolmap("triangulate") as pycolmap, tempfile.TemporaryDirectory() as scratch:
+        folder, database = Path(scratch), Path(scratch, "database.db")
+        names = _stored_photos(capture, chosen, folder / "photos")
+        groups = _write_known(capture, chosen, names, folder / "known")
+        extraction = pycolmap.FeatureExtractionOptions(
+            use_gpu=False, num_threads=threads or -1, max_image_size=longest_side
+        )
+        done = 0
+        for number, (model, parameters, members) in enumerate(groups, 1):
+            for position in members:  # one at a time, so that a bar moves
+                tell("features", done, len(names))
+                reader = pycolmap.ImageReaderOptions(camera_model=model, camera_params=parameters)
+                if position != members[0]:
+                    reader.existing_camera_id = number
+                pycolmap.extract_features(
+                    database,
+                    folder / "photos",
+                    image_names=[names[position]],
+                    camera_mode=pycolmap.CameraMode.SINGLE,
+                    reader_options=reader,
+                    extraction_options=extraction,
+                    device=pycolmap.Device.cpu,
+                )
+                done += 1
+        tell("features", done, len(names))
+        _match(pycolmap, database, names, seed=seed, threads=threads, tell=tell)
+        tell("points", 0, 1)
+        model = _triangulated(pycolmap, database, folder, names)
+        tell("points", 1, 1)
+        if not model.num_points3D():
+            raise InvalidArgument(
+                f"triangulate: nothing matches in the {len(names)} photos: they show different things"
+            )
+        originals = dict(zip(names, (capture.names[index] for index in chosen)))
+        for image in model.images.values():
+            image.name = originals[image.name]
+        (folder / "model").mkdir()
+        model.write_binary(folder / "model")
+        points = read_points(
+            folder / "model",
+            [capture.names[index] for index in chosen],
+            capture.cameras.select(chosen),
+            transform=capture.transform,
+        )
+        if out is not None:
+            with new_folder(out) as partial:
+                for path in (folder / "model").iterdir():
+                    shutil.copyfile(path, partial / path.name)
+    return points
+
+
+def _stored_photos(capture: Capture, chosen: NDArray[np.int64], folder: Path) -> list[str]:
+    """Put the photos where COLMAP finds them, under names without spaces that say their order."""
+    from PIL import Image
+
+    folder.mkdir()
+    names = []
+    for position, index in enumerate(chosen.tolist()):
+        source, plain = capture.paths[index], index not in capture.upright
+        ending = source.suffix.lower()
+        if plain and ending in PLAIN:
+            names.append(f"{position:06d}{ending}")
+            (folder / names[-1]).symlink_to(source.resolve())
+            continue
+        names.append(f"{position:06d}.png")
+        width, height = capture.photo_size(index)
+        pixels = read_photo(source, width, height, upright=not plain, background=capture.background)
+        Image.fromarray((pixels * 255).round().astype(np.uint8)).save(folder / names[-1])
+    return names
+
+
+def _write_known(
+    capture: Capture, chosen: NDArray[np.int64], names: Sequence[str], folder: Path
+) -> list[tuple[str, str, list[int]]]:
+    """A text model of the known poses; photos of one lens: COLMAP's camera model, its parameters, their positions."""
+    folder.mkdir()
+    lenses: dict[tuple[Any, ...], list[int]] = {}
+    for position, index in enumerate(chosen.tolist()):
+        lenses.setdefault(_lens(capture, index), []).append(position)
+    camera_of = {position: number for number, members in enumerate(lenses.values(), 1) for position in members}
+    cameras, images = [], []
+    for number, (model, width, height, *parameters) in enumerate(lenses, 1):
+        cameras.append(f"{number} {model} {width} {height} {' '.join(map(repr, parameters))}\n")
+    order = [position for members in lenses.values() for position in members]  # as the database numbers them
+    for number, position in enumerate(order, 1):
+        pose = capture.cameras.camera_to_world[chosen[position]]
+        rotation = TO_COLMAP @ pose[:, :3].T  # world to camera
+        origin = (pose[:, 3] - capture.transform[:3, 3]) / capture.transform[0, 0]
+        values = [*_quaternion(rotation), *(-rotation @ origin)]
+        images.append(
+            f"{number} {' '.join(repr(float(v)) for v in values)} {camera_of[position]} {names[position]}\n\n"
+        )
+    (folder / "cameras.txt").write_text("".join(cameras), encoding="utf-8")
+    (folder / "images.txt").write_text("".join(images), encoding="utf-8")
+    (folder / "points3D.txt").write_text("", encoding="utf-8")
+    return [(lens[0], ",".join(map(repr, lens[3:])), members) for lens, members in lenses.items()]
+
+
+def _lens(capture: Capture, index: int) -> tuple[Any, ...]:
+    """COLMAP's camera model, width, height and parameters of a photo at its own size."""
+    width, height = capture.photo_size(index)
+    seen = capture.cameras.size(index)
+    scale = np.array([width / seen[0], height / seen[1]] * 2)
+    fx, fy, cx, cy = (capture.cameras.intrinsics[index] * scale).tolist()
+    k1, k2, k3, k4, p1, p2 = capture.cameras.distortion[index].tolist()
+    if capture.cameras.fisheye[index]:
+        return ("OPENCV_FISHEYE", width, height, fx, fy, cx, cy, k1, k2, k3, k4)
+    if k4:
+        raise InvalidArgument(
+            f"triangulate: COLMAP has no lens with k4 = {k4} in the numerator (photo {capture.names[index]}): "
+            "undistort the photos first"
+        )
+    if k3:
+        return ("FULL_OPENCV", width, height, fx, fy, cx, cy, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
+    return ("OPENCV", width, height, fx, fy, cx, cy, k1, k2, p1, p2)
+
+
+def _quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """``(w, x, y, z)`` of a rotation matrix, from the eigenvector of its symmetric 4 x 4 form (Bar-Itzhack 2000)."""
+    m = rotation
+    form = np.array(
+        [
+            [m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
+            [m[2, 1] - m[1, 2], m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]],
+            [m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], m[1, 1] - m[0, 0] - m[2, 2], m[1, 2] + m[2, 1]],
+            [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], m[2, 2] - m[0, 0] - m[1, 1]],
+        ]
+    )
+    vector: NDArray[np.float64] = np.linalg.eigh(form)[1][:, -1]
+    return vector if vector[0] >= 0 else -vector
+
+
+def _match(pycolmap: Any, database: Path, names: Sequence[str], *, seed: int, threads: int, tell: Progress) -> None:
+    options = pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=threads or -1)
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = seed
+    chosen = pycolmap.ImportedPairingOptions()
+    chosen.match_list_path = database.with_name("pairs.txt")
+    pairs = list(combinations(names, 2))
+    for start in range(0, len(pairs), MATCH_AT_ONCE):
+        tell("pairs", start, len(pairs))
+        lines = (f"{one} {other}\n" for one, other in pairs[start : start + MATCH_AT_ONCE])
+        database.with_name("pairs.txt").write_text("".join(lines), encoding="utf-8")
+        pycolmap.match_image_pairs(
+            database,
+            matching_options=options,
+            pairing_options=chosen,
+            verification_options=verification,
+            device=pycolmap.Device.cpu,
+        )
+    tell("pairs", len(pairs), len(pairs))
+
+
+def _triangulated(pycolmap: Any, database: Path, folder: Path, names: Sequence[str]) -> Any:
+    """The known model with points; its ids are those of the database, which is checked."""
+    known = pycolmap.Reconstruction(folder / "known")
+    with pycolmap.Database.open(database) as opened:
+        stored = {image.name: (image.image_id, image.camera_id) for image in opened.read_all_images()}
+    for image in known.images.values():
+        if stored.get(image.name) != (image.image_id, image.camera_id):
+            raise RuntimeError(f"triangulate: the database numbers {image.name} otherwise: {stored.get(image.name)}")
+    (folder / "triangulated").mkdir()
+    return pycolmap.triangulate_points(known, database, folder / "photos", folder / "triangulated")
