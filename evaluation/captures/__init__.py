@@ -17,8 +17,10 @@ if TYPE_CHECKING:
     from .loading import load_cameras as load_cameras
     from .loading import load_capture as load_capture
     from .nerfstudio import write_nerfstudio as write_nerfstudio
+    from .points import read_points as read_points
     from .posing import PosingSettings as PosingSettings
     from .splits import choose_split as choose_split
+    from .triangulation import triangulate as triangulate
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
@@ -29,7 +31,9 @@ __getattr__, __dir__, __all__ = attach(
         ".difficulty": ["difficulty_rows", "difficulty_text", "every_nth"],
         ".loading": ["Capture", "load_cameras", "load_capture"],
         ".nerfstudio": ["write_nerfstudio"],
+        ".points": ["read_points"],
         ".posing": ["PosingSettings"],
         ".splits": ["choose_split"],
+        ".triangulation": ["triangulate"],
     },
 )
