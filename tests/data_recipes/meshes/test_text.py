@@ -1,6 +1,5 @@
 """OBJ, OFF and text STL: lawful files of odd shapes, and numbers that only Python reads."""
 
-
 import numpy as np
 import pytest
 
