@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import warnings
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any, Literal
@@ -182,7 +183,7 @@ class DensityRegularizer:
     def _sight_lines_of(self, points: SparsePoints | None) -> SightLines | None:
         """Lines in the box that the visibility loss reaches; the loss may ask the field anywhere in it."""
         s = self.settings
-        if points is None or not len(points):
+        if points is None:
             return None
         if self.cameras is None:
             raise InvalidArgument("DensityRegularizer: points must come with cameras, got cameras=None")
@@ -194,7 +195,14 @@ class DensityRegularizer:
         warn_if_not_in_view(points, self.cameras, caller="DensityRegularizer")
         box, cell = grow_box(self.aabb, s.visibility_reach), self._nominal_pitch()
         pitch = max(cell, scene_extent(box) / MOST_LINE_CELLS)
-        return SightLines.build(points, self.cameras, aabb=box, pitch=pitch, field_pitch=cell)
+        lines = SightLines.build(points, self.cameras, aabb=box, pitch=pitch, field_pitch=cell)
+        if not len(lines):
+            warnings.warn(
+                f"DensityRegularizer: the sight-line loss is 0, as no line is left of {len(points)} points with "
+                f"{len(points.point)} observations: points need tracks, and rays from different places in the box",
+                stacklevel=4,
+            )
+        return lines
 
     def observe(self, positions: Any, values: Any, *, kind: Literal["density", "weight"] = "density") -> None:
         """Tell the importance grid what you rendered anyway; never needed, always cheap.

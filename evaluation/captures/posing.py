@@ -120,7 +120,16 @@ def pose_jointly(
                 leftover.unlink()
             _extract(pycolmap, database, Path(folder), lenses, how, tell)
             state.save(features=True)
-        _match(pycolmap, database, names, how, tell, state)
+        match_pairs(
+            pycolmap,
+            database,
+            names,
+            seed=how.seed,
+            threads=how.threads,
+            tell=tell,
+            first=state.pairs,
+            matched=lambda pairs: state.save(pairs=pairs),
+        )
         if not state.poses:
             shutil.rmtree(Path(scratch, PARTS), ignore_errors=True)
             parts = _map(pycolmap, database, Path(folder), Path(scratch, PARTS), len(names), how, tell)
@@ -209,17 +218,36 @@ def _extract(
     tell("features", total, total)
 
 
-def _match(
-    pycolmap: Any, database: Path, names: Sequence[str], how: PosingSettings, tell: Progress, state: _State
+def match_pairs(
+    pycolmap: Any,
+    database: Path,
+    names: Sequence[str],
+    *,
+    seed: int,
+    threads: int,
+    tell: Progress,
+    first: int = 0,
+    matched: Callable[[int], None] | None = None,
 ) -> None:
-    """Every pair of photos, some hundred at a time."""
-    options = pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=_threads(how))
+    """Match every pair of photos by their features, some hundred pairs at a time.
+
+    Args:
+        pycolmap: the module.
+        database: COLMAP's, with the features of all photos; ``pairs.txt`` is written beside it.
+        names: of the photos.
+        seed: of the verification's random choices.
+        threads: 0 for one per core.
+        tell: called with ``"pairs"``, how many are matched, and how many there are.
+        first: pairs that are matched already.
+        matched: called with the number of matched pairs after each part.
+    """
+    options = pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=threads or -1)
     verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = how.seed
+    verification.ransac.random_seed = seed
     chosen = pycolmap.ImportedPairingOptions()
     chosen.match_list_path = database.with_name("pairs.txt")
     pairs = list(combinations(names, 2))
-    for start in range(state.pairs, len(pairs), MATCH_AT_ONCE):
+    for start in range(first, len(pairs), MATCH_AT_ONCE):
         tell("pairs", start, len(pairs))
         lines = (f"{one} {other}\n" for one, other in pairs[start : start + MATCH_AT_ONCE])
         database.with_name("pairs.txt").write_text("".join(lines), encoding="utf-8")
@@ -230,7 +258,8 @@ def _match(
             verification_options=verification,
             device=pycolmap.Device.cpu,
         )
-        state.save(pairs=start + MATCH_AT_ONCE)
+        if matched is not None:
+            matched(start + MATCH_AT_ONCE)
     tell("pairs", len(pairs), len(pairs))
 
 

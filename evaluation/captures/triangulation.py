@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Callable, Sequence
-from itertools import combinations
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,13 +17,12 @@ from ...core.sparse_points import SparsePoints
 from .colmap import quiet_pycolmap
 from .photos import read_photo
 from .points import read_points
+from .posing import Progress, match_pairs
 
 if TYPE_CHECKING:
     from .loading import Capture
 
-Progress = Callable[[str, int, int], None]
 PLAIN = (".jpg", ".jpeg", ".png")  # COLMAP reads these from disk; others are decoded first
-MATCH_AT_ONCE = 200
 LONGEST_SIDE = 1600
 TO_COLMAP = np.diag([1.0, -1.0, -1.0])  # OpenGL's camera axes to COLMAP's
 
@@ -91,7 +89,7 @@ def triangulate(
                 )
                 done += 1
         tell("features", done, len(names))
-        _match(pycolmap, database, names, seed=seed, threads=threads, tell=tell)
+        match_pairs(pycolmap, database, names, seed=seed, threads=threads, tell=tell)
         tell("points", 0, 1)
         model = _triangulated(pycolmap, database, folder, names)
         tell("points", 1, 1)
@@ -196,27 +194,6 @@ def _quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     )
     vector: NDArray[np.float64] = np.linalg.eigh(form)[1][:, -1]
     return vector if vector[0] >= 0 else -vector
-
-
-def _match(pycolmap: Any, database: Path, names: Sequence[str], *, seed: int, threads: int, tell: Progress) -> None:
-    options = pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=threads or -1)
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = seed
-    chosen = pycolmap.ImportedPairingOptions()
-    chosen.match_list_path = database.with_name("pairs.txt")
-    pairs = list(combinations(names, 2))
-    for start in range(0, len(pairs), MATCH_AT_ONCE):
-        tell("pairs", start, len(pairs))
-        lines = (f"{one} {other}\n" for one, other in pairs[start : start + MATCH_AT_ONCE])
-        database.with_name("pairs.txt").write_text("".join(lines), encoding="utf-8")
-        pycolmap.match_image_pairs(
-            database,
-            matching_options=options,
-            pairing_options=chosen,
-            verification_options=verification,
-            device=pycolmap.Device.cpu,
-        )
-    tell("pairs", len(pairs), len(pairs))
 
 
 def _triangulated(pycolmap: Any, database: Path, folder: Path, names: Sequence[str]) -> Any:

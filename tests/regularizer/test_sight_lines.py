@@ -1,3 +1,5 @@
+import functools
+
 import numpy as np
 import pytest
 import torch
@@ -99,8 +101,11 @@ def test_without_points_or_lines_it_is_zero(denoiser):
     cameras, points = watched_plane(count=20)
     field = plane_and_ghost(torch.tensor([30.0, 5.0]))
     trackless = SparsePoints.create(points.xyz)
-    for given in (None, SparsePoints.create(np.zeros((0, 3))), trackless):
-        regularizer = DensityRegularizer(denoiser, aabb=AABB, cameras=cameras, points=given, field_pitch=PITCH, cubes=1)
+    build = functools.partial(DensityRegularizer, denoiser, aabb=AABB, cameras=cameras, field_pitch=PITCH, cubes=1)
+    assert build()(field)["sight_lines"] == 0.0
+    for given in (SparsePoints.create(np.zeros((0, 3))), trackless):
+        with pytest.warns(UserWarning, match=r"the sight-line loss is 0, as no line is left of \d+ points with 0 obs"):
+            regularizer = build(points=given)
         assert regularizer(field)["sight_lines"] == 0.0
 
 

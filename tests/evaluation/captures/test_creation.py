@@ -29,11 +29,11 @@ class _Colmap:
 
     def __init__(self, monkeypatch):
         self.calls, self.broken, self.posed = [], None, 6
-        for step in ("_extract", "_match", "_map"):
+        for step in ("_extract", "match_pairs", "_map"):
             monkeypatch.setattr(posing, step, self._step(step))
 
     def _step(self, step):
-        def run(colmap, database, *arguments):
+        def run(colmap, database, *arguments, **_):
             if step == self.broken:
                 raise RuntimeError("the machine went down")
             self.calls.append(step)
@@ -74,7 +74,13 @@ def test_after_a_crash_the_same_call_goes_on(sweeps, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:  # photos are not extracted again either
         patch.setattr(creation, "extract_frames", None)
         told = make_capture(*sweeps, out)
-    assert colmap.calls == ["_extract", "_match", "_match", "_map", "_match"]  # what is matched is skipped inside
+    assert colmap.calls == [
+        "_extract",
+        "match_pairs",
+        "match_pairs",
+        "_map",
+        "match_pairs",
+    ]  # what is matched is skipped inside
     assert not work.exists()
     assert told["versions"]["pycolmap"] == pycolmap.__version__
     assert len(load_capture(out).split("train")) == len(load_capture(out).split("eval")) == 3
@@ -117,7 +123,10 @@ def test_matching_goes_on_after_the_pairs_that_are_done(tmp_path):
         def match_image_pairs(database, **_):
             matched.extend(database.with_name("pairs.txt").read_text().splitlines())
 
-    posing._match(Stand, tmp_path / "d.db", list("abcd"), PosingSettings(), lambda *_: None, state)
+    how = {"seed": 0, "threads": 0, "tell": lambda *_: None}
+    posing.match_pairs(
+        Stand, tmp_path / "d.db", list("abcd"), first=state.pairs, matched=lambda pairs: state.save(pairs=pairs), **how
+    )
     assert matched == ["b d", "c d"]  # the last two of six
 
 
