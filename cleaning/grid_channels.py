@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Callable, Sequence
 
@@ -11,18 +12,23 @@ from numpy.typing import NDArray
 from ..core.aabb import contains
 from ..core.cameras import Cameras
 from ..core.channels import (
+    CROSSINGS,
     POOLED,
+    SUPPORT,
     SURROUNDINGS,
     TRANSMITTANCE,
     VIEW_COUNT,
     encode_share,
     encode_surroundings,
     encode_view_count,
+    evidence_share,
     pool_surroundings,
 )
 from ..core.frames import RESOLUTION, cube_lattices
 from ..core.occupancy import EMPTY
 from ..core.shards.storage import SURROUNDINGS_RESOLUTION, TRANSMITTANCE_RESOLUTION
+from ..core.sight_lines import SightLines
+from ..core.sparse_points import SparsePoints
 from ..core.visibility.transmittance import DensityFn, TransmittanceMaps
 from ..core.visibility.view_counts import count_views, pinholes
 
@@ -115,6 +121,55 @@ def light_channel(
     return encode_share(maps.best_view(lattice))
 
 
+def evidence_lines(
+    names: Sequence[str],
+    points: SparsePoints | None,
+    cameras: Cameras | None,
+    *,
+    aabb: NDArray[np.float64],
+    pitch: float,
+) -> SightLines | None:
+    """Sight lines on a grid of the field's own pitch, or None if the denoiser does not use them or there are no points.
+
+    Args:
+        names: the denoiser's channels.
+        points: of the training photos, in the frame of ``cameras``.
+        cameras: of the training photos.
+        aabb: ``(2, 3)``.
+        pitch: side of the field's cells.
+
+    Example:
+        >>> from unghost.core.cameras import look_at
+        >>> poses = look_at(np.array([[2.0, 0.0, 0.0], [0.0, 2.0, 0.0]]), np.zeros((2, 3)))
+        >>> cameras = Cameras.create(poses, np.array([100.0, 100.0, 50.0, 50.0]), width=100, height=100)
+        >>> points = SparsePoints.create(np.zeros((1, 3)), point=[0, 0], camera=[0, 1], cameras=cameras)
+        >>> box = np.array([[-1.0] * 3, [1.0] * 3])
+        >>> evidence_lines(("signed_opacity",), points, cameras, aabb=box, pitch=0.1) is None
+        True
+        >>> len(evidence_lines(("signed_opacity", "support"), points, cameras, aabb=box, pitch=0.1))
+        2
+    """
+    if points is None or cameras is None or not len(points) or not {SUPPORT, CROSSINGS} & set(names):
+        return None
+    return SightLines.build(points, cameras, aabb=aabb, pitch=pitch)
+
+
+def evidence_channels(
+    lines: SightLines, centers: FloatArray, edges: FloatArray, rotations: FloatArray | None = None
+) -> dict[str, FloatGrid]:
+    """The channels ``support`` and, if any camera observed a point, ``crossings`` of cubes: ``(N, 32, 32, 32)`` each.
+
+    Args:
+        lines: on a grid of the field's own pitch.
+        centers, edges, rotations: ``(N, 3)``, ``(N,)``, ``(N, 3, 3)`` or None for axis-aligned cubes.
+    """
+    lattice = cube_lattices(centers, edges, rotations)
+    channels = {SUPPORT: encode_share(evidence_share(lines.support(lattice)))}
+    if len(lines):
+        channels[CROSSINGS] = encode_share(evidence_share(lines.crossings(lattice)))
+    return channels
+
+
 class GridContext:
     """What a denoiser may be told about windows of a grid beyond their cells.
 
@@ -129,6 +184,7 @@ class GridContext:
         pitch: side of its cells.
         cameras: of the training photos; None for view counts that are unknown.
         maps: of :func:`light_maps`; None for transmittances that are unknown.
+        lines: of :func:`evidence_lines`; None for support and crossings that are unknown.
     """
 
     def __init__(
@@ -140,12 +196,15 @@ class GridContext:
         pitch: float,
         cameras: Cameras | None = None,
         maps: TransmittanceMaps | None = None,
+        lines: SightLines | None = None,
     ) -> None:
         self.names, self.signed, self.origin, self.pitch = tuple(names), signed, origin, pitch
         self.cameras = viewing_cameras(cameras, names)
         self.maps = maps if TRANSMITTANCE in names else None
+        self.lines = lines
         self._tiles: dict[Corner, FloatGrid] = {}
         self._light_tiles: dict[Corner, FloatGrid] = {}
+        self._evidence_tiles: dict[Corner, dict[str, FloatGrid]] = {}
 
     def known(self, corners: Sequence[Corner]) -> dict[str, FloatGrid]:
         """The channels that can be told, of windows whose first cells are ``corners`` (these may lie outside)."""
@@ -157,6 +216,11 @@ class GridContext:
             told[VIEW_COUNT] = np.stack([_cut(corner, RESOLUTION, self._views) for corner in corners])
         if self.maps is not None:
             told[TRANSMITTANCE] = np.stack([self._window_light(corner) for corner in corners])
+        if self.lines is not None:
+            names = (SUPPORT, CROSSINGS) if len(self.lines) else (SUPPORT,)
+            for name in names:
+                tiles = functools.partial(self._evidence, name)
+                told[name] = np.stack([_cut(corner, RESOLUTION, tiles) for corner in corners])
         return told
 
     def _about(self, corner: Corner) -> FloatGrid:
@@ -182,6 +246,14 @@ class GridContext:
             assert self.cameras is not None
             self._tiles[tile] = view_channel(self.cameras, *self._frame(_times(tile, RESOLUTION)))[0]
         return self._tiles[tile]
+
+    def _evidence(self, name: str, tile: Corner) -> FloatGrid:
+        """Support or crossings of those cells."""
+        if tile not in self._evidence_tiles:
+            assert self.lines is not None
+            channels = evidence_channels(self.lines, *self._frame(_times(tile, RESOLUTION)))
+            self._evidence_tiles[tile] = {key: values[0] for key, values in channels.items()}
+        return self._evidence_tiles[tile][name]
 
     def _light(self, tile: Corner) -> FloatGrid:
         """The transmittances of those cells, in blocks of two."""

@@ -15,15 +15,18 @@ from numpy.typing import ArrayLike, NDArray
 from ..core.aabb import as_aabb, scene_extent
 from ..core.arrays import is_tensor, to_numpy
 from ..core.cameras import Cameras, warn_if_elsewhere, warn_if_turned_away
+from ..core.channels import CROSSINGS, SUPPORT, TRANSMITTANCE, VIEW_COUNT
 from ..core.config import override
 from ..core.errors import InvalidArgument
 from ..core.lattice import lattice_origin, look_up_cells
 from ..core.manifest import Denoiser
 from ..core.occupancy import OccupancyRule
 from ..core.schedule import check_timestep
+from ..core.sight_lines import SightLines
+from ..core.sparse_points import SparsePoints, warn_if_not_in_view
 from ..core.visibility.transmittance import TransmittanceMaps
 from .denoiser_calls import check_denoiser
-from .grid_channels import GridContext, light_maps
+from .grid_channels import GridContext, evidence_lines, light_maps
 from .grid_sampling import Survey, survey_field
 from .keep_mask import KeepMask
 from .post_processing import decide, removed_regions
@@ -121,6 +124,7 @@ def clean(
     *,
     denoiser: Denoiser,
     cameras: Cameras | None = None,
+    points: SparsePoints | None = None,
     settings: CleanSettings | None = None,
     progress: Progress | None = None,
     **overrides: Any,
@@ -141,6 +145,9 @@ def clean(
         denoiser: kind ``"numpy"`` or ``"torch"``. One that asks for the surroundings gets them from the same grid.
         cameras: of the training photos, for a denoiser that asks who sees a cell (view counts, transmittances);
             without them that is unknown. A warning is raised if the denoiser does not ask.
+        points: sparse points of the training photos, in the frame of ``cameras``, whose indices their observations
+            use; for a denoiser that takes ``support`` and ``crossings``. Only points triangulated from the training
+            photos alone may be used for anything that is scored.
         settings: see :class:`CleanSettings`; ``overrides`` replace single ones (``field_pitch`` foremost).
         progress: called with (windows done, windows in all), level by level.
 
@@ -163,7 +170,14 @@ def clean(
         >>> cleaned_fn = mask.apply(density_fn)
     """
     return judge(
-        density_fn, aabb, denoiser=denoiser, cameras=cameras, settings=settings, progress=progress, **overrides
+        density_fn,
+        aabb,
+        denoiser=denoiser,
+        cameras=cameras,
+        points=points,
+        settings=settings,
+        progress=progress,
+        **overrides,
     ).mask()
 
 
@@ -257,6 +271,7 @@ def judge(
     *,
     denoiser: Denoiser,
     cameras: Cameras | None = None,
+    points: SparsePoints | None = None,
     settings: CleanSettings | None = None,
     progress: Progress | None = None,
     **overrides: Any,
@@ -277,7 +292,8 @@ def judge(
     box = as_aabb(aabb, caller="clean")
     check_denoiser(denoiser, caller="clean")
     warn_if_turned_away(cameras, box, caller="clean")
-    _warn_if_unused(cameras, denoiser)
+    _warn_if_unused(cameras, points, denoiser)
+    _check_points(points, cameras)
     warn_if_elsewhere(cameras, box, caller="clean")
     pitch, shape = grid_of(box, s)
     query = make_query(density_fn, place=box.mean(axis=0), backend=s.backend, chunk=s.chunk, caller="clean")
@@ -296,18 +312,37 @@ def judge(
         rows=s.chunk,
     )
     maps = light_maps(denoiser.manifest.channels, cameras, query, aabb=box, pitch=s.field_pitch or pitch)
-    score, windows = _score(survey, denoiser, s, box, pitch, cameras, maps, progress)
+    lines = evidence_lines(denoiser.manifest.channels, points, cameras, aabb=box, pitch=s.field_pitch or pitch)
+    score, windows = _score(survey, denoiser, s, box, pitch, cameras, maps, lines, progress)
     about = {"windows": windows, "denoiser": denoiser.manifest.name}
     return Judgement(box, pitch, score, s, denoiser.manifest.removal_threshold, survey, about)
 
 
-def _warn_if_unused(cameras: Cameras | None, denoiser: Denoiser) -> None:
-    if cameras is not None and not {"view_count", "transmittance"} & set(denoiser.manifest.channels):
+def _warn_if_unused(cameras: Cameras | None, points: SparsePoints | None, denoiser: Denoiser) -> None:
+    names, channels = denoiser.manifest.name, set(denoiser.manifest.channels)
+    if points is not None and not {SUPPORT, CROSSINGS} & channels:
         warnings.warn(
-            f"clean: cameras are not used by the denoiser {denoiser.manifest.name!r} (as by default and xs); views uses"
+            f"clean: points are not used by the denoiser {names!r}; evidence uses them (--denoiser evidence)",
+            stacklevel=4,
+        )
+    if cameras is not None and not {VIEW_COUNT, TRANSMITTANCE, SUPPORT, CROSSINGS} & channels:
+        warnings.warn(
+            f"clean: cameras are not used by the denoiser {names!r} (as by default and xs); views uses"
             " them (--denoiser views), but does worse than default where every ghost is visible to a training camera",
             stacklevel=4,
         )
+
+
+def _check_points(points: SparsePoints | None, cameras: Cameras | None) -> None:
+    if points is None:
+        return
+    if cameras is None:
+        raise InvalidArgument("clean: points must come with cameras, got cameras=None")
+    if len(points.camera) and int(points.camera.max()) >= len(cameras):
+        raise InvalidArgument(
+            f"clean: points must refer to the {len(cameras)} cameras, got camera {int(points.camera.max())}"
+        )
+    warn_if_not_in_view(points, cameras, caller="clean")
 
 
 def grid_of(aabb: NDArray[np.float64], settings: CleanSettings) -> tuple[float, tuple[int, int, int]]:
@@ -342,6 +377,7 @@ def _score(
     pitch: float,
     cameras: Cameras | None,
     maps: TransmittanceMaps | None,
+    lines: SightLines | None,
     progress: Progress | None,
 ) -> tuple[FloatGrid, int]:
     """Weighted mean of the levels' votes, and the windows it took."""
@@ -364,7 +400,9 @@ def _score(
             overlap=s.overlap,
             skip_empty=s.skip_empty,
             progress=progress,
-            context=GridContext(names, signed, origin=origin, pitch=factor * pitch, cameras=cameras, maps=maps),
+            context=GridContext(
+                names, signed, origin=origin, pitch=factor * pitch, cameras=cameras, maps=maps, lines=lines
+            ),
         )
         total += np.float32(weight / sum(s.level_weights)) * grow(votes, factor, total.shape)
         windows += sent

@@ -35,12 +35,14 @@ Float32 = NDArray[np.float32]
 
 SIGNED_OPACITY, SURROUNDINGS, VIEW_COUNT = "signed_opacity", "surroundings", "view_count"
 TRANSMITTANCE = "transmittance"
-CHANNEL_NAMES = (SIGNED_OPACITY, SURROUNDINGS, VIEW_COUNT, TRANSMITTANCE)
+SUPPORT, CROSSINGS = "support", "crossings"
+CHANNEL_NAMES = (SIGNED_OPACITY, SURROUNDINGS, VIEW_COUNT, TRANSMITTANCE, SUPPORT, CROSSINGS)
 OPTIONAL_CHANNELS = CHANNEL_NAMES[1:]
 UNKNOWN = -1.0
 LEAST_KNOWN = -0.5  # of an optional channel: an empty voxel, no view
 POOLED = 2  # points along an axis of each voxel of the surroundings
 REPEAT = RESOLUTION // SURROUNDINGS_RESOLUTION
+EVIDENCE_GAIN, EVIDENCE_BITS = 8.0, 8.0  # a typical cell (1) is stored as .4; 32 times that as 1
 
 
 def check_channels(names: Sequence[str], *, caller: str) -> tuple[str, ...]:
@@ -74,6 +76,18 @@ def encode_view_count(counts: NDArray[np.integer]) -> Float32:
     return encode_share(share)
 
 
+def evidence_share(relative: NDArray[np.floating]) -> Float32:
+    """Relative support or crossings ``(...)`` >= 0 to shares in [0, 1]: ``log2(1 + 8 min(r, 31.875)) / 8``.
+
+    Args:
+        relative: 1 in a typical cell that has any (:meth:`unghost.core.sight_lines.SightLines.support`).
+    """
+    most = (2.0**EVIDENCE_BITS - 1.0) / EVIDENCE_GAIN
+    capped = np.minimum(np.asarray(relative, dtype=np.float32), np.float32(most))
+    share: Float32 = np.log2(np.float32(1.0) + np.float32(EVIDENCE_GAIN) * capped) / np.float32(EVIDENCE_BITS)
+    return share
+
+
 def encode_share(share: NDArray[np.floating]) -> Float32:
     """Shares ``(...)`` in [0, 1], of light for ``transmittance``, to an optional channel's values in [-1/2, 1]."""
     encoded: Float32 = np.float32(LEAST_KNOWN) + np.float32(1.0 - LEAST_KNOWN) * np.asarray(share, dtype=np.float32)
@@ -99,6 +113,8 @@ def encode_known(
     surroundings: NDArray[np.floating] | None = None,
     view_count: NDArray[np.integer] | None = None,
     transmittance: NDArray[np.floating] | None = None,
+    support: NDArray[np.floating] | None = None,
+    crossings: NDArray[np.floating] | None = None,
 ) -> dict[str, Float32]:
     """The optional channels that are known, encoded, by name.
 
@@ -106,6 +122,7 @@ def encode_known(
         surroundings: ``(N, 16, 16, 16)`` mean signed opacity.
         view_count: ``(N, 32, 32, 32)``.
         transmittance: ``(N, 16, 16, 16)`` shares of light.
+        support, crossings: ``(N, 32, 32, 32)`` shares of :func:`evidence_share`.
     """
     known: dict[str, Float32] = {}
     if surroundings is not None:
@@ -114,6 +131,10 @@ def encode_known(
         known[VIEW_COUNT] = encode_view_count(view_count)
     if transmittance is not None:
         known[TRANSMITTANCE] = encode_share(transmittance)
+    if support is not None:
+        known[SUPPORT] = encode_share(support)
+    if crossings is not None:
+        known[CROSSINGS] = encode_share(crossings)
     return known
 
 

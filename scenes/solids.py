@@ -198,6 +198,15 @@ class SolidScene:
         normals: Array = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
         return normals
 
+    def albedo(self, positions: Array) -> Array:
+        """Albedo ``(N, 3)`` in [0, 1] of the solid nearest to ``positions (N, 3)``."""
+        owner = self.nearest(positions)[1]
+        albedo = np.zeros_like(positions)
+        for index in np.unique(owner):
+            mine = owner == index
+            albedo[mine] = self.solids[index].texture.albedo(positions[mine])
+        return albedo
+
     def shade(self, positions: Array, directions: Array) -> Array:
         """Colour ``(N, 3)`` in [0, 1] of surface points seen along unit ``directions``: Lambert plus a gloss lobe."""
         normals = self.normals(positions)

@@ -98,6 +98,8 @@ def predict(denoiser: Any, cubes: CubeSet, rows: NDArray[np.int64], timestep: in
         surroundings=None if about is None else dequantize_signed(about[rows]),
         view_count=None if views is None else views[rows],
         transmittance=None if light is None else dequantize_share(light[rows]),
+        support=None if cubes.support is None else dequantize_share(cubes.support[rows]),
+        crossings=None if cubes.crossings is None else dequantize_share(cubes.crossings[rows]),
     )
     channels = stack_channels(denoiser.manifest.channels, cubes.signed[rows], known)
     edge = cubes.edge_fraction[rows]

@@ -36,6 +36,7 @@ SEVERITIES = (0.1, 0.3, 0.5, 0.8, 1.0)
 MIXED = "mixed"
 BUBBLES = ("bits", "soft")  # the families of the set of that name
 FIELD_EDGE, IN_A_FIELD = 0.5, 0.8  # the edge fraction, and the severity of the mixed corruption shown at it
+KNOWN = ("surroundings", "view_count", "transmittance", "support", "crossings")  # beside the opacity
 CAPTURE_CUBES = 160  # of each of three fields
 
 
@@ -54,6 +55,7 @@ class CubeSet:
         surroundings: ``(N, 16, 16, 16)`` uint8, or None.
         view_count: ``(N, 32, 32, 32)`` uint8, or None.
         transmittance: ``(N, 16, 16, 16)`` uint8, or None.
+        support, crossings: ``(N, 32, 32, 32)`` uint8, or None.
     """
 
     name: str
@@ -65,6 +67,8 @@ class CubeSet:
     surroundings: NDArray[np.uint8] | None = None
     view_count: NDArray[np.uint8] | None = None
     transmittance: NDArray[np.uint8] | None = None
+    support: NDArray[np.uint8] | None = None
+    crossings: NDArray[np.uint8] | None = None
 
     def __len__(self) -> int:
         return len(self.signed)
@@ -81,12 +85,13 @@ class CubeSet:
 
 def blind(cubes: CubeSet) -> CubeSet:
     """The set with every optional channel unknown."""
-    return dataclasses.replace(cubes, surroundings=None, view_count=None, transmittance=None)
+    unknown: dict[str, Any] = dict.fromkeys(KNOWN)
+    return dataclasses.replace(cubes, **unknown)
 
 
 def tells_more(cubes: CubeSet) -> bool:
     """Whether the set knows more of its cubes than their opacity."""
-    return any(value is not None for value in (cubes.surroundings, cubes.view_count, cubes.transmittance))
+    return any(getattr(cubes, name) is not None for name in KNOWN)
 
 
 def from_shards(name: str, shards: list[Shard], count: int, **about: Any) -> CubeSet:
@@ -104,7 +109,7 @@ def from_shards(name: str, shards: list[Shard], count: int, **about: Any) -> Cub
     }
     for key in ("edge_fraction", "group"):
         arrays[key] = np.concatenate([getattr(shard, key)[rows] for shard, _, rows in parts])
-    for key in ("surroundings", "view_count", "transmittance"):
+    for key in KNOWN:
         if all(getattr(shard, key) is not None for shard in shards):
             arrays[key] = np.concatenate([getattr(shard, key)[rows] for shard, _, rows in parts])
     return CubeSet(name, about, **arrays)

@@ -42,6 +42,8 @@ OPTIONAL_ARRAYS: Layout = {
     "surroundings": ((SURROUNDINGS_RESOLUTION,) * 3, "uint8"),
     "view_count": ((RESOLUTION,) * 3, "uint8"),
     "transmittance": ((TRANSMITTANCE_RESOLUTION,) * 3, "uint8"),
+    "support": ((RESOLUTION,) * 3, "uint8"),
+    "crossings": ((RESOLUTION,) * 3, "uint8"),
     "frames": ((FRAME_NUMBERS,), "float64"),
     "source": ((), "int32"),
 }
@@ -139,7 +141,8 @@ def write_shard(
             Optional: ``surroundings (N, 16, 16, 16) uint8`` (quantised signed opacity, same centre and rotation,
             three times the edge), ``view_count (N, 32, 32, 32) uint8`` (training views that saw a voxel, capped
             at 255), ``transmittance (N, 16, 16, 16) uint8`` (255 times the share of light that the best training
-            camera gets, see :mod:`unghost.core.visibility.transmittance`), ``frames (N, 13) float64``
+            camera gets, see :mod:`unghost.core.visibility.transmittance`), ``support`` and ``crossings
+            (N, 32, 32, 32) uint8`` (255 times :func:`unghost.core.channels.evidence_share`), ``frames (N, 13) float64``
             (:func:`pack_frame`), ``source (N,) int32`` (a row of ``provenance["sources"]``, -1 for none).
         provenance: JSON-able; kept in the manifest.
         kind: ``harvest`` for cubes of fitted fields, ``pairs`` for all others; training treats them differently.
@@ -204,6 +207,8 @@ class Shard:
     surroundings: NDArray[np.uint8] | None = None
     view_count: NDArray[np.uint8] | None = None
     transmittance: NDArray[np.uint8] | None = None
+    support: NDArray[np.uint8] | None = None
+    crossings: NDArray[np.uint8] | None = None
     frames: NDArray[np.float64] | None = None
     source: NDArray[np.int32] | None = None
     kind: ShardKind = "pairs"

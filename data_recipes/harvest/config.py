@@ -31,6 +31,8 @@ class HarvestConfig:
         voxel_pitch: voxel side in field cells, log-uniform.
         rotated_share: share of cubes with a random rotation.
         room_pitch: voxel side of :func:`room_scene`'s cubes, scene units, log-uniform.
+        point_sets: sets of simulated sparse points a snapshot (:mod:`unghost.scenes.sparse_points`), of very
+            different numbers; each serves its share of the cubes. 0: the channels support and crossings are not stored.
         fewest_opaque: a fit has failed, and its scene is given up, if a smaller share of the surface is opaque.
         most_ghosts: the same if a larger share of what is opaque are ghosts.
     """
@@ -49,6 +51,7 @@ class HarvestConfig:
     voxel_pitch: tuple[float, float] = (0.5, 2.0)
     rotated_share: float = 0.5
     room_pitch: tuple[float, float] = (0.008, 0.05)
+    point_sets: int = 4
     fewest_opaque: float = 0.1
     most_ghosts: float = 0.9
 
@@ -74,6 +77,8 @@ class HarvestConfig:
             )
         if min(self.rays, self.cubes) < 1:
             raise InvalidArgument(f"HarvestConfig: rays and cubes must be >= 1, got {self.rays} and {self.cubes}")
+        if self.point_sets < 0:
+            raise InvalidArgument(f"HarvestConfig: point_sets must be >= 0, got {self.point_sets}")
         if self.observer_photos < 0 or self.observer_width < 4:
             raise InvalidArgument(
                 "HarvestConfig: observer_photos must be >= 0 and observer_width >= 4, got "

@@ -1,4 +1,4 @@
-"""Opacity in and around a harvested cube; view counts come from :mod:`unghost.core.visibility.view_counts`."""
+"""Opacity and evidence in and around a harvested cube. View counts: :mod:`unghost.core.visibility.view_counts`."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.aabb import contains
-from ...core.channels import pool_surroundings, surroundings_lattice
+from ...core.channels import evidence_share, pool_surroundings, surroundings_lattice
 from ...core.occupancy import EMPTY, opacity_from_density, signed_from_opacity
+from ...core.shards.packing import quantize_share
+from ...core.sight_lines import SightLines
 
 DensityFn = Callable[[NDArray[Any]], NDArray[np.float32]]
 
@@ -60,3 +62,19 @@ def surroundings(
     """
     lattice = surroundings_lattice(centers, edges, rotations)
     return pool_surroundings(signed_opacity(density_fn, lattice, pitch, aabb))
+
+
+def evidence(lines: SightLines, lattice: NDArray[np.float64]) -> dict[str, NDArray[np.uint8]]:
+    """Sparse points and sight lines at the points of some cubes, as a shard stores them.
+
+    Args:
+        lines: on a grid of the field's own pitch.
+        lattice: ``(N, R, R, R, 3)``.
+
+    Returns:
+        ``support`` and ``crossings``, ``(N, R, R, R)`` uint8.
+    """
+    return {
+        "support": quantize_share(evidence_share(lines.support(lattice))),
+        "crossings": quantize_share(evidence_share(lines.crossings(lattice))),
+    }

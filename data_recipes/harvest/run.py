@@ -32,22 +32,25 @@ from ...core.shards.packing import (
     unpack_labels,
 )
 from ...core.shards.storage import TRANSMITTANCE_RESOLUTION, read_shard, write_shard
+from ...core.sight_lines import SightLines
 from ...core.visibility.transmittance import TransmittanceMaps
 from ...core.visibility.view_counts import count_views
-from ..engines import LocalEngine
+from ..engines import Engine, LocalEngine, open_engine
 from ..folder_lock import locked
 from .config import HarvestConfig
-from .context import signed_opacity, surroundings
+from .context import evidence, signed_opacity, surroundings
 from .labels import HIDDEN, Labeller, Truth, check_fit, severity_of
 from .resume import finished, scene_folder
 from .rooms import draw_objects_of, room_cubes
 
 if TYPE_CHECKING:
     from ...core.distances.sampled import SampledDistance
+    from ...core.sparse_points import SparsePoints
     from ...fields.kinds import TrainableField
     from ...scenes.generator import PhotographedScene
 
 OBSERVER_STREAM = 0x6F6273  # keeps the other sweep apart from all else
+POINT_STREAM = 0x73666D  # the same for the sparse points
 EARLY = 0.45  # share of the fit at which the first cubes are taken
 TOGETHER, QUERY = 8, 1 << 17  # cubes, and points in them, that are worked on at a time
 
@@ -92,9 +95,17 @@ def _propose(rng: np.random.Generator, field: TrainableField, count: int) -> NDA
 
 
 def harvest_cubes(
-    rng: np.random.Generator, field: TrainableField, truth: Labeller, config: HarvestConfig
+    rng: np.random.Generator,
+    field: TrainableField,
+    truth: Labeller,
+    config: HarvestConfig,
+    *,
+    points: Sequence[SparsePoints] = (),
 ) -> dict[str, NDArray[Any]]:
-    """Cut ``config.cubes`` cubes out of a fitted field and label them: a shard's arrays, less ``group``."""
+    """Cut ``config.cubes`` cubes out of a fitted field and label them: a shard's arrays, less ``group``.
+
+    ``points``: sets of sparse points, each for as many of the cubes; without any, there is no evidence.
+    """
     count = config.cubes
     centers = _propose(rng, field, count)
     low, high = np.log(config.voxel_pitch)
@@ -105,7 +116,8 @@ def harvest_cubes(
     density_fn = _density_fn(field)
     maps = TransmittanceMaps.build(density_fn, truth.cameras, aabb=field.aabb, field_pitch=field.field_pitch)
     parts: list[dict[str, NDArray[Any]]] = []
-    for start in range(0, count, TOGETHER):
+    lines = [SightLines.build(each, truth.cameras, aabb=field.aabb, pitch=field.field_pitch) for each in points]
+    for number, start in enumerate(range(0, count, TOGETHER)):
         some = slice(start, start + TOGETHER)
         frames = (centers[some], edges[some], rotations[some])
         lattice = cube_lattices(*frames)
@@ -125,6 +137,7 @@ def harvest_cubes(
                 "surroundings": quantize_signed(about),
                 "view_count": count_views(truth.cameras, *frames),
                 "transmittance": light,
+                **(evidence(lines[number % len(lines)], lattice) if lines else {}),
             }
         )
     arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
@@ -152,6 +165,13 @@ def _draw_field(rng: np.random.Generator, config: HarvestConfig) -> tuple[str, i
     resolution = int(rng.choice(config.resolutions))
     opacity = float(np.exp(rng.uniform(np.log(0.002), np.log(0.03))))
     return kind, resolution, make_field(kind, resolution, initial_opacity=opacity, seed=int(rng.integers(2**31)))
+
+
+def _point_sets(rng: np.random.Generator, photographed: PhotographedScene, config: HarvestConfig) -> list[SparsePoints]:
+    """Simulated sparse points, set by set."""
+    from ...scenes.sparse_points import simulate_sparse_points
+
+    return [simulate_sparse_points(rng, photographed) for _ in range(config.point_sets)]
 
 
 @_one_thread()
@@ -189,14 +209,18 @@ def harvest_scene(
     truth = Truth(photographed, field.aabb, observers=others)
     parts: list[dict[str, NDArray[Any]]] = []
 
+    def cut() -> None:
+        points = _point_sets(np.random.default_rng([seed, index, POINT_STREAM, len(parts)]), photographed, config)
+        parts.append(harvest_cubes(rng, field, truth, config, points=points))
+
     def snapshot(fitted: TrainableField, step: int) -> None:
         if step == round(EARLY * steps):
-            parts.append(harvest_cubes(rng, fitted, truth, config))
+            cut()
 
     report = train_field(
         field, photographed.cameras, photographed.images, steps=steps, seed=index, config=fitting, regularizer=snapshot
     )
-    parts.append(harvest_cubes(rng, field, truth, config))
+    cut()
     arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     arrays["group"] = np.full(len(arrays["inputs"]), index, dtype=np.int32)
     check_fit(
@@ -254,6 +278,11 @@ def _work(
     return index, ""
 
 
+def _engine(name: str, workers: int, *, ahead: int) -> Engine:
+    """An engine that makes all scenes at once, as far as its workers go: a scene takes a minute."""
+    return LocalEngine(workers, ahead=ahead, apart=True) if name == "local" else open_engine(name, workers)
+
+
 def harvest(
     out: str | Path,
     *,
@@ -266,6 +295,7 @@ def harvest(
     mesh_root: str | Path | None = None,
     progress: bool = False,
     log: Callable[[str], None] | None = None,
+    engine: str = "local",
 ) -> int:
     """Harvest scenes ``first .. first + scenes - 1``, one shard each; those already there are checked and skipped.
 
@@ -273,7 +303,8 @@ def harvest(
     dies costs the same. A second run in the same folder at the same time is refused
     (:mod:`unghost.data_recipes.folder_lock`). Without ``fit``, cubes are of perfect fields with synthetic corruption
     (:func:`room_scene`): quick, and needs no torch. ``log`` hears of scenes that were given up. ``mesh_root`` is a
-    folder of meshes with its manifest, for objects beside the procedural ones.
+    folder of meshes with its manifest, for objects beside the procedural ones. ``engine`` is ``"local"`` (spawned
+    processes) or ``"ray"`` (a cluster, whose machines share ``out``).
 
     Returns:
         The number of pairs now in ``out``.
@@ -291,9 +322,9 @@ def harvest(
         wanted = range(first, first + scenes)
         todo = [i for i in wanted if not finished(folder, seed, i, config, fit=fit, meshes=root is not None)]
         with (
-            LocalEngine(workers, ahead=len(todo), apart=True) as engine,
+            _engine(engine, workers, ahead=len(todo)) as pool,
             progress_bar(len(todo), unit="scene", shown=progress) as bar,
-            closing(engine.ordered(_work, ((str(folder), seed, i, config, fit, root) for i in todo))) as done,
+            closing(pool.ordered(_work, ((str(folder), seed, i, config, fit, root) for i in todo))) as done,
         ):
             for index, problem in done:
                 if problem and log is not None:

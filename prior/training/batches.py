@@ -19,8 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.channels import (
+    CROSSINGS,
     OPTIONAL_CHANNELS,
     SIGNED_OPACITY,
+    SUPPORT,
     SURROUNDINGS,
     TRANSMITTANCE,
     VIEW_COUNT,
@@ -118,10 +120,13 @@ def stored_channels(
         return None if stored is None or name not in names or name in without else stored
 
     about, views, light = told(SURROUNDINGS), told(VIEW_COUNT), told(TRANSMITTANCE)
+    support, crossings = told(SUPPORT), told(CROSSINGS)
     known = encode_known(
         surroundings=None if about is None else opacity(about),
         view_count=None if views is None else views[index],
         transmittance=None if light is None else dequantize_share(light[index]) ** np.float32(depth),
+        support=None if support is None else dequantize_share(support[index]),
+        crossings=None if crossings is None else dequantize_share(crossings[index]),
     )
     return stack_channels(names, opacity(shard.inputs), known)
 
@@ -184,6 +189,8 @@ class Mixture:
         depth = float(np.exp(rng.uniform(-DEPTH_JITTER, DEPTH_JITTER)))
         chances = rng.random(len(OPTIONAL_CHANNELS))  # by name: the order of channels is the caller's
         chance = dict(zip(OPTIONAL_CHANNELS, chances))
+        if chance[SUPPORT] < self.drop_channels:
+            chance[CROSSINGS] = 0.0  # without points there are no sight lines; points without tracks do exist
         dropped = frozenset(name for name, value in chance.items() if value < self.drop_channels)
         harvested, edge, anew = _harvested(shard), float(shard.edge_fraction[cube]), any_edge(rng)
         if self.redraw_edges:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from unghost.cleaning.grid_channels import GridContext, light_maps, viewing_cameras
+from unghost.cleaning.grid_channels import GridContext, evidence_lines, light_maps, viewing_cameras
 from unghost.cleaning.pipeline import clean
 from unghost.core.cameras import Cameras
 from unghost.core.channels import (
@@ -14,8 +14,10 @@ from unghost.core.channels import (
     encode_share,
     encode_surroundings,
     encode_view_count,
+    evidence_share,
 )
 from unghost.core.frames import cube_lattices, random_rotations, unit_lattice
+from unghost.core.sparse_points import SparsePoints
 from unghost.core.visibility.transmittance import FAN, STEPS
 from unghost.core.visibility.view_counts import count_views
 from unghost.data_recipes.harvest.context import surroundings
@@ -131,6 +133,51 @@ def test_nobody_counts_for_a_denoiser_that_does_not_ask(crowd):
     assert not viewing_cameras(bent, CHANNEL_NAMES).distortion.any()
 
 
+def observed(cameras, tracks=True):
+    """Points in front of the cameras, each seen by those that have it in their frustum."""
+    places = np.random.default_rng(8).uniform(-1, 1, size=(300, 3))
+    seen = np.stack([cameras.sees(np.full(len(places), index), places) for index in range(len(cameras))])
+    camera, point = np.nonzero(seen) if tracks else ((), ())
+    return SparsePoints.create(places, point=point, camera=camera, cameras=cameras)
+
+
+def seen_without_points(kit, kind):
+    return getattr(kit, kind)(keep_first, channels=("signed_opacity", "view_count"))
+
+
+def test_evidence_of_windows_is_that_of_cubes(crowd, aabb):
+    names, signed, origin = CHANNEL_NAMES, np.full((40, 40, 40), -1, np.float32), np.array([-1.0, -0.9, -1.1])
+    lines = evidence_lines(names, observed(crowd), crowd, aabb=aabb, pitch=PITCH)
+    context = GridContext(names, signed, origin=origin, pitch=0.05, lines=lines)
+    channels = context.known(CORNERS)
+    lattice = cube_lattices(*windows(CORNERS, origin, 0.05), None)
+    for name in ("support", "crossings"):
+        expected = encode_share(evidence_share(getattr(lines, name)(lattice)))
+        np.testing.assert_allclose(channels[name], expected, atol=1e-5)
+        assert expected.std() > 0.05
+    assert len(context._evidence_tiles) <= 3 * 8
+
+
+def test_points_without_tracks_support_but_cross_nothing(crowd, aabb):
+    names, signed = CHANNEL_NAMES, np.full((40, 40, 40), -1, np.float32)
+    lines = evidence_lines(names, observed(crowd, tracks=False), crowd, aabb=aabb, pitch=PITCH)
+    context = GridContext(names, signed, origin=aabb[0], pitch=0.05, lines=lines)
+    assert set(context.known(CORNERS)) == {"surroundings", "support"}
+    assert evidence_lines(names[:4], observed(crowd), crowd, aabb=aabb, pitch=PITCH) is None
+    assert evidence_lines(names, None, crowd, aabb=aabb, pitch=PITCH) is None
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [({"cameras": None}, "points must come with cameras"), ({"cameras": 2}, "points must refer to the 2 cameras")],
+)
+def test_points_that_do_not_fit_are_refused(kit, aabb, crowd, change, message):
+    denoiser = kit.numpy_denoiser(keep_first, channels=("signed_opacity", "support"))
+    cameras = None if change["cameras"] is None else crowd.select(range(change["cameras"]))
+    with pytest.raises(ValueError, match=f"clean: {message}"):
+        clean(waves, aabb, denoiser=denoiser, cameras=cameras, points=observed(crowd), resolution=16)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["numpy_denoiser", "torch_denoiser"])
 def test_cleaning_tells_all_it_knows(kit, aabb, crowd, kind):
@@ -138,13 +185,15 @@ def test_cleaning_tells_all_it_knows(kit, aabb, crowd, kind):
         getattr(kit, kind)(keep_first, channels=names)
         for names in (
             CHANNEL_NAMES,
-            ("signed_opacity", "view_count", "surroundings", "transmittance"),
+            ("signed_opacity", "view_count", "surroundings", "transmittance", "crossings", "support"),
             CHANNEL_NAMES[:1],
         )
     )
     options = {"field_pitch": PITCH, "level_weights": (1.0,)}
     clean(waves, aabb, denoiser=seen, **options)
-    clean(waves, aabb, denoiser=told, cameras=crowd, **options)
+    clean(waves, aabb, denoiser=told, cameras=crowd, points=observed(crowd), **options)
+    with pytest.warns(UserWarning, match="points are not used by the denoiser .*--denoiser evidence"):
+        clean(waves, aabb, denoiser=seen_without_points(kit, kind), cameras=crowd, points=observed(crowd), **options)
     with pytest.warns(UserWarning, match="cameras are not used by the denoiser .*--denoiser views"):
         clean(waves, aabb, denoiser=alone, cameras=crowd, **options)
     blind, all_, one = (np.concatenate([call[0] for call in d.calls]) for d in (seen, told, alone))

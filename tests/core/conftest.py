@@ -25,6 +25,8 @@ def _optional():
         "surroundings": (np.arange(2 * 16**3) * 5 % 256).astype(np.uint8).reshape(2, 16, 16, 16),
         "view_count": (np.arange(2 * 32**3) * 3 % 256).astype(np.uint8).reshape(2, 32, 32, 32),
         "transmittance": (np.arange(2 * 16**3) * 7 % 256).astype(np.uint8).reshape(2, 16, 16, 16),
+        "support": (np.arange(2 * 32**3) * 11 % 256).astype(np.uint8).reshape(2, 32, 32, 32),
+        "crossings": (np.arange(2 * 32**3) * 13 % 256).astype(np.uint8).reshape(2, 32, 32, 32),
         "frames": np.stack([pack_frame(turned), pack_frame(None)]),
         "source": np.array([0, -1], dtype=np.int32),
     }

@@ -12,6 +12,7 @@ from unghost.core.channels import (
     coincident_weights,
     encode_surroundings,
     encode_view_count,
+    evidence_share,
     full_channel,
     pool_surroundings,
     stack_channels,
@@ -38,6 +39,14 @@ def test_views_by_hand():
     assert (np.diff(every) > 0).all()
     assert every.min() == LEAST_KNOWN
     assert UNKNOWN not in every
+
+
+def test_evidence_by_hand():
+    # log2(1 + 8 r) / 8: nothing, 1/8 of a typical cell, a typical one (log2 9), 31.875 times that and more
+    share = evidence_share(np.array([0.0, 0.125, 1.0, 31.875, 1e9]))
+    assert share.dtype == np.float32
+    np.testing.assert_allclose(share, [0.0, 0.125, 3.169925 / 8, 1.0, 1.0], atol=1e-6)
+    assert (np.diff(evidence_share(np.linspace(0, 31.8, 400))) > 0).all()
 
 
 def test_surroundings_by_hand():

@@ -47,6 +47,8 @@ def make_context(count: int, seed: int) -> dict[str, np.ndarray]:
     return {
         "surroundings": rng.integers(0, 256, (count, 16, 16, 16), dtype=np.uint8),
         "view_count": rng.integers(0, 40, (count, 32, 32, 32), dtype=np.uint8),
+        "support": rng.integers(0, 256, (count, 32, 32, 32), dtype=np.uint8),
+        "crossings": rng.integers(0, 256, (count, 32, 32, 32), dtype=np.uint8),
         "transmittance": rng.integers(0, 256, (count, 16, 16, 16), dtype=np.uint8),
     }
 

@@ -71,6 +71,7 @@ def harvest(
     fit: bool = True,
     kinds: tuple[str, ...] = (),
     mesh_root: Path | None = None,
+    engine: Literal["local", "ray"] = "local",
     options: Annotated[HarvestOptions, arg(name="")] = HarvestOptions(),  # noqa: B008 (frozen)
 ) -> None:
     """Fit radiance fields to few photos of synthetic scenes; cut out cubes beside the truth.
@@ -88,6 +89,8 @@ def harvest(
         kinds: of field, NAME or NAME=SHARE: dense, hash, mlp; dense and hash if not given. mlp is meant to be
             held out: harvest it apart, with another seed, for evaluation.
         mesh_root: a folder of meshes with its manifest.csv; some of its train split stand in the scenes then.
+        engine: where the workers run; ray uses the cluster of RAY_ADDRESS, whose machines must share the folder, or
+            else starts one on this machine.
     """
     from ..data_recipes.harvest.run import harvest as make
 
@@ -106,6 +109,7 @@ def harvest(
         mesh_root=mesh_root,
         progress=True,
         log=print,
+        engine=engine,
     )
     print(f"{pairs} pairs under {out}")
 

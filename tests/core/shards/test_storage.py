@@ -24,6 +24,8 @@ OPTIONAL_GOLDEN = {  # of `optional` below
     "surroundings": "abe967333828afa4c583c96182bd02b0a3f61b37f136d6bdc090968dec48cb9b",
     "view_count": "9449251a75a68516f5dc76752f18b9c357586cdbed4303c5b8f0edf3200d5ba3",
     "transmittance": "0049f0c8bd18657fd9d9fd22c1630b6a408eb4405bf2ba9843bb17ed491420ca",
+    "support": "2d7542537ffa14f05cb1224f820940eb03a729349fb20554abd19430430dc642",
+    "crossings": "6875b56182fb65a6cf4f569543951eabbca564520570c95cdcfc03551c54bd7d",
     "frames": "224ee94ea3dd006d5a83afdbd375d4b1c82b1ea046362013f65a92a5bab0f38c",
     "source": "c461e9435ee35ce314b3e42cf27575b055fecf1f8272fee6af2d8840c4aff870",
 }

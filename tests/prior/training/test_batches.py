@@ -204,6 +204,8 @@ def test_all_channels_and_the_labels_move_together(shard_paths):
             full_channel(encode_surroundings(coarse)),
             encode_view_count(shard.view_count[draw.cube]),
             full_channel(encode_share((shard.transmittance[draw.cube] / np.float32(255)) ** draw.depth)),
+            encode_share(shard.support[draw.cube] / np.float32(255)),  # evidence does not depend on the depth
+            encode_share(shard.crossings[draw.cube] / np.float32(255)),
         ]
         assert len(expected) == len(CHANNEL_NAMES)
         for found, grid in zip(batch.channels[row], expected):
@@ -218,7 +220,10 @@ def test_optional_channels_are_dropped_one_by_one(shard_paths):
     mixture = Mixture([(shard_paths["seen"], 1.0)], seed=0, channels=CHANNEL_NAMES, drop_channels=0.3)
     gone = (mixture.batch(0, 300).channels == UNKNOWN).all(axis=(2, 3, 4))
     assert not gone[:, 0].any()
-    np.testing.assert_allclose(gone[:, 1:].mean(axis=0), 0.3, atol=0.08)
+    np.testing.assert_allclose(gone[:, 1:5].mean(axis=0), 0.3, atol=0.08)
+    support, crossings = gone[:, CHANNEL_NAMES.index("support")], gone[:, CHANNEL_NAMES.index("crossings")]
+    assert not (support & ~crossings).any()  # without points there are no lines; without tracks there are points
+    assert crossings.mean() == pytest.approx(1 - 0.7 * 0.7, abs=0.08)
     assert (gone[:, 1] & gone[:, 2]).mean() == pytest.approx(0.09, abs=0.05)
     whole = Mixture([(shard_paths["seen"], 1.0)], seed=0, channels=CHANNEL_NAMES).batch(0, 300)
     assert not (whole.channels[:, 1:] == UNKNOWN).any()
