@@ -29,7 +29,8 @@ from .denoiser_calls import check_denoiser
 from .grid_channels import GridContext, evidence_lines, light_maps
 from .grid_sampling import Survey, survey_field
 from .keep_mask import KeepMask
-from .post_processing import decide, removed_regions
+from .photo_veto import PhotoVeto, apply_veto
+from .post_processing import decide, limit_removal, optical_depth, removed_regions
 from .queries import CHUNK, Backend, make_query
 from .sliding_window import Progress, grow, shrink, vote
 
@@ -37,6 +38,7 @@ FloatGrid = NDArray[np.float32]
 
 DEFAULT_RESOLUTION = 128
 MOST_CELLS = 1 << 27
+MUCH = 0.3  # share of the optical depth whose removal is worth a warning
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,8 @@ class CleanSettings:
         resolution: cells along the longest side; None for the field's own pitch, or 128 if that is unknown.
         rule: density to occupancy.
         strength: in [0, 1]: 0 removes nothing, 0.5 is the denoiser's advised threshold, 1 removes all that is occupied.
+        budget: in (0, 1]: at most this share of the grid's optical depth is removed, faint cells included, those of
+            the lowest score first. A cell counts for at most 4.6 (99 % of the light).
         level_weights: of the votes at the grid's own pitch, at twice that, at four times …; 0 skips a level.
         overlap: of neighbouring windows, in [0, 1).
         timestep: for the denoiser; None for its default.
@@ -76,6 +80,7 @@ class CleanSettings:
     resolution: int | None = None
     rule: OccupancyRule = dataclasses.field(default_factory=OccupancyRule)
     strength: float = 0.5
+    budget: float = 1.0
     level_weights: tuple[float, ...] = (1.0, 0.5)
     overlap: float = 0.5
     timestep: int | None = None
@@ -97,6 +102,7 @@ class CleanSettings:
             "field_pitch": (pitch is None or (math.isfinite(pitch) and pitch > 0), "finite and > 0"),
             "resolution": (self.resolution is None or self.resolution >= 1, ">= 1"),
             "strength": (0.0 <= self.strength <= 1.0, "in [0, 1]"),
+            "budget": (0.0 < self.budget <= 1.0, "in (0, 1]"),
             "level_weights": (
                 len(levels) > 0 and all(math.isfinite(w) and w >= 0 for w in levels) and sum(levels) > 0,
                 "finite, >= 0 and not all 0",
@@ -125,6 +131,7 @@ def clean(
     denoiser: Denoiser,
     cameras: Cameras | None = None,
     points: SparsePoints | None = None,
+    veto: PhotoVeto | None = None,
     settings: CleanSettings | None = None,
     progress: Progress | None = None,
     **overrides: Any,
@@ -148,6 +155,8 @@ def clean(
         points: sparse points of the training photos, in the frame of ``cameras``, whose indices their observations
             use; for a denoiser that takes ``support`` and ``crossings``. Only points triangulated from the training
             photos alone may be used for anything that is scored.
+        veto: training photos of ``cameras`` and a way to render them: where removal makes them worse, density is given
+            back (:mod:`unghost.cleaning.photo_veto`).
         settings: see :class:`CleanSettings`; ``overrides`` replace single ones (``field_pitch`` foremost).
         progress: called with (windows done, windows in all), level by level.
 
@@ -169,7 +178,9 @@ def clean(
         (True, [True])
         >>> cleaned_fn = mask.apply(density_fn)
     """
-    return judge(
+    if veto is not None and cameras is None:
+        raise InvalidArgument("clean: photos must come with cameras, got cameras=None")
+    judgement = judge(
         density_fn,
         aabb,
         denoiser=denoiser,
@@ -178,7 +189,12 @@ def clean(
         settings=settings,
         progress=progress,
         **overrides,
-    ).mask()
+    )
+    mask = judgement.mask()
+    if veto is not None and cameras is not None:
+        mask = apply_veto(mask, veto, density_fn, judgement.signed, cameras)
+    _warn_if_much(mask)
+    return mask
 
 
 @dataclass(frozen=True)
@@ -210,6 +226,11 @@ class Judgement:
     advised: float
     _survey: Survey
     _about: dict[str, Any]
+
+    @property
+    def signed(self) -> NDArray[np.float32]:
+        """``(X, Y, Z)`` signed opacity of the cells."""
+        return self._survey.signed
 
     def doubt(self, positions: Any) -> Any:
         """How much the denoiser doubts what is at ``positions (..., 3)``: ``(...)`` float32 in [0, 1].
@@ -245,6 +266,11 @@ class Judgement:
             else (np.zeros_like(survey.judged[part]),) * 2
         )
         removed, faint = removed & ~survey.protected[part], faint & ~survey.protected[part]
+        depth, total = optical_depth(survey.signed[part]), float(optical_depth(survey.signed).sum())
+        if s.budget < 1:
+            going = limit_removal(removed | faint, self.score[part], depth, most=s.budget * total)
+            removed, faint = removed & going, faint & going
+        share = float(depth[removed | faint].sum()) / total if total else 0.0
         corner = [span.start * self.pitch for span in part]
         origin = lattice_origin(self.aabb, self.pitch, shape) + corner
         regions, region_count = removed_regions(removed, self.score[part], origin, self.pitch)
@@ -254,6 +280,7 @@ class Judgement:
             "occupied": int(survey.occupied.sum()),
             "removed": int(removed.sum()),
             "faint_removed": int(faint.sum()),
+            "depth_removed_share": share,
             "asked": survey.asked,
             "dropped": survey.dropped,
             "threshold": threshold,
@@ -329,6 +356,17 @@ def _warn_if_unused(cameras: Cameras | None, points: SparsePoints | None, denois
         warnings.warn(
             f"clean: cameras are not used by the denoiser {names!r} (as by default and xs); views uses"
             " them (--denoiser views), but does worse than default where every ghost is visible to a training camera",
+            stacklevel=4,
+        )
+
+
+def _warn_if_much(mask: KeepMask) -> None:
+    share, everything = mask.details["depth_removed_share"], mask.details["settings"]["strength"] == 1
+    if share > MUCH and not everything:
+        warnings.warn(
+            f"clean: {share:.0%} of the field's optical depth is removed; where that is fog which its own photos rely "
+            "on, they get worse: look at a preview, set budget (at most this share is removed), or give the photos and "
+            "a way to render them",
             stacklevel=4,
         )
 

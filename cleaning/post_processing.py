@@ -13,6 +13,7 @@ Mask = NDArray[np.bool_]
 
 MAJORITY = 0.5  # a piece with a larger share of cells voted empty goes whole ...
 LARGEST_WHOLE = 0.25  # ... unless it holds more than this share of all that is occupied
+MOST_DEPTH = -float(np.log(0.01))  # of a cell: 99 % of the light
 MOST_REGIONS = 100  # listed in a summary
 
 
@@ -70,6 +71,43 @@ def decide(
         removed &= ~dilate(occupied & ~removed)
     stays = dilate(occupied & ~removed)
     return removed, judged & ~occupied & (score < threshold) & ~stays
+
+
+def optical_depth(signed: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Optical depth of cells by their signed opacity, at most ``MOST_DEPTH``: what is deeper looks no different.
+
+    Example:
+        >>> optical_depth(np.array([-1.0, 0.0, 1.0], np.float32)).round(3).tolist()  # nothing, half, all of the light
+        [0.0, 0.693, 4.605]
+    """
+    through = np.maximum((1.0 - signed.astype(np.float64)) / 2.0, np.exp(-MOST_DEPTH))
+    depth: NDArray[np.float64] = -np.log(through)
+    return depth
+
+
+def limit_removal(removed: Mask, score: NDArray[np.float32], depth: NDArray[np.float64], *, most: float) -> Mask:
+    """Keep a removal within a budget of optical depth: cells of the lowest score first.
+
+    Args:
+        removed: ``(X, Y, Z)`` bool.
+        score: ``(X, Y, Z)`` in [-1, 1].
+        depth: ``(X, Y, Z)`` optical depth of each cell.
+        most: sum of the depth that may go.
+
+    Returns:
+        The cells that still go, ``(X, Y, Z)`` bool.
+
+    Example:
+        >>> removed, score = np.ones((1, 1, 3), bool), np.array([[[-0.2, -0.9, -0.5]]], np.float32)
+        >>> limit_removal(removed, score, np.ones((1, 1, 3)), most=2.0).tolist()
+        [[[False, True, True]]]
+    """
+    cells = np.flatnonzero(removed)
+    order = cells[np.argsort(score.ravel()[cells], kind="stable")]
+    within = np.cumsum(depth.ravel()[order]) <= most * (1 + 1e-12)
+    limited = np.zeros(removed.size, dtype=bool)
+    limited[order[within]] = True
+    return limited.reshape(removed.shape)
 
 
 def _small_pieces(mask: Mask, fewest: int) -> Mask:

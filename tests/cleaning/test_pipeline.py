@@ -122,6 +122,34 @@ def test_strength_runs_from_nothing_to_everything(kit):
     assert all((weak.cells | ~strong.cells).all() for weak, strong in itertools.pairwise(masks))
 
 
+def test_a_budget_limits_what_goes(kit):
+    denoiser = kit.numpy_denoiser(lambda channels: np.clip(channels - 0.2, -1, 1))
+    whole = clean(room_density, BOX, denoiser=denoiser, field_pitch=PITCH, smallest=0, speck=0, strength=0.6)
+    share = whole.summary()["depth_removed_share"]
+    assert 0.02 < share < 0.5
+    limited = clean(
+        room_density, BOX, denoiser=denoiser, field_pitch=PITCH, smallest=0, speck=0, strength=0.6, budget=share / 3
+    )
+    assert 0.8 * share / 3 < limited.summary()["depth_removed_share"] <= share / 3 * (1 + 1e-9)
+    assert limited.cells[whole.cells].all()
+    ample = clean(
+        room_density, BOX, denoiser=denoiser, field_pitch=PITCH, smallest=0, speck=0, strength=0.6, budget=0.99
+    )
+    np.testing.assert_array_equal(ample.cells, whole.cells)
+
+
+def test_a_large_removal_is_a_warning(kit):
+    denoiser = kit.numpy_denoiser(lambda channels: np.full_like(channels, -0.5))
+    with pytest.warns(UserWarning, match="clean: 100% of the field's optical depth is removed; .* set budget"):
+        clean(room_density, BOX, denoiser=denoiser, field_pitch=PITCH, fringe=0)
+
+
+@pytest.mark.parametrize("budget", [0.0, -0.1, 1.1, float("nan")])
+def test_impossible_budgets_are_refused(budget):
+    with pytest.raises(ValueError, match=r"clean: budget must be in \(0, 1\]"):
+        CleanSettings(budget=budget)
+
+
 def test_threshold_of_strength():
     for advised in (-0.7, 0.0, 0.4):
         assert threshold_of(0.0, advised) == -1.0
@@ -129,6 +157,7 @@ def test_threshold_of_strength():
         assert threshold_of(1.0, advised) > 1.0
 
 
+@pytest.mark.filterwarnings("ignore:clean. .*optical depth is removed")
 def test_nothing_at_all_and_everything_full(kit):
     for level in (0.0, 1e30):
         for predict in (kit.all_empty, kit.all_full):
@@ -141,11 +170,13 @@ def test_nothing_at_all_and_everything_full(kit):
             json.dumps(mask.summary())
 
 
+@pytest.mark.filterwarnings("ignore:clean. .*optical depth is removed")
 def test_a_callable_that_does_not_look_at_its_positions_is_pointed_out(kit):
     with pytest.warns(UserWarning, match="clean: density_fn returned 4 at each of 4500 places"):
         clean(lambda p: np.full(len(p), 4.0), BOX, denoiser=kit.numpy_denoiser(kit.identity), resolution=20)
 
 
+@pytest.mark.filterwarnings("ignore:clean. .*optical depth is removed")
 def test_keep_boxes_are_left_alone(kit):
     box = [[-1.0, -1.0, 0.3], [1.0, 1.0, 0.5]]
     mask = clean(room_density, BOX, denoiser=kit.numpy_denoiser(kit.all_empty), field_pitch=PITCH, keep_boxes=(box,))
@@ -153,6 +184,7 @@ def test_keep_boxes_are_left_alone(kit):
     assert mask.keep(positions).tolist() == [True, False]
 
 
+@pytest.mark.filterwarnings("ignore:clean. .*optical depth is removed")
 def test_a_box_that_the_pitch_does_not_divide(kit):
     box = np.array([[0.0, 0.0, 0.0], [1.0, 0.55, 0.01]])
 

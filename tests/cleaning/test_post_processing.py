@@ -1,6 +1,6 @@
 import numpy as np
 
-from unghost.cleaning.post_processing import decide, removed_regions
+from unghost.cleaning.post_processing import decide, limit_removal, optical_depth, removed_regions
 
 
 def scene():
@@ -75,3 +75,29 @@ def test_regions_by_hand():
     assert regions[0] == {"voxels": 8, "volume": 1.0, "box": [[1, 2, 3], [2, 3, 4]], "confidence": 0.75}
     assert regions[1]["box"] == [[3.5, 4.5, 5.0], [4.0, 5.0, 6.0]]
     assert removed_regions(np.zeros((2, 2, 2), bool), score[:2, :2, :2], np.zeros(3), 1.0) == ([], 0)
+
+
+def test_optical_depth_by_hand():
+    # light that gets through: all, 1/e, 1 %, nothing
+    signed = np.array([-1.0, 1 - 2 / np.e, 0.98, 1.0], np.float32)
+    np.testing.assert_allclose(optical_depth(signed), [0, 1, np.log(100), np.log(100)], rtol=1e-4, atol=1e-7)
+
+
+def test_a_budget_takes_the_most_certain_cells_first():
+    rng = np.random.default_rng(0)
+    removed, score = rng.random((6, 7, 8)) < 0.5, rng.uniform(-1, 1, (6, 7, 8)).astype(np.float32)
+    depth = rng.random((6, 7, 8))
+    before = removed.copy()
+    for share in (0.0, 0.2, 0.7, 1.0):
+        most = share * depth[removed].sum()
+        limited = limit_removal(removed, score, depth, most=most)
+        assert not (limited & ~removed).any()
+        assert depth[limited].sum() <= most * (1 + 1e-9)
+        left = removed & ~limited
+        if left.any() and limited.any():
+            assert score[limited].max() <= score[left].min()
+        if left.any():  # no further cell fits
+            first = np.flatnonzero(left)[np.argmin(score[left])]
+            assert depth[limited].sum() + depth.ravel()[first] > most
+    np.testing.assert_array_equal(limited, removed)
+    np.testing.assert_array_equal(removed, before)
