@@ -75,8 +75,8 @@ def apply_veto(
 
     A cell's blame is the mean rise of the squared error over the pixels that see it, weighted by how much of the
     pixel's light comes from the cell. Each round gives back the cells with more than a third of the largest blame, and
-    of the threshold before; after the last one every cell that any photo sees is given back. So the
-    photos lose about ``veto.max_psnr_drop`` dB at most (errors below 40 dB count as 40 dB), and what no photo sees stays removed.
+    of the threshold before; after the last one every cell that any photo sees is given back. So the photos lose about
+    ``veto.max_psnr_drop`` dB at most (errors below 40 dB count as 40 dB), and what no photo sees stays removed.
 
     Args:
         mask: what would be removed.

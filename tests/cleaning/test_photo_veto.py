@@ -66,7 +66,7 @@ def veto_of(cameras, render, **changes):
 
 
 def test_what_photos_show_comes_back_and_what_they_do_not_stays_away(cameras, render, parts):
-    signed, haze, blob, wall = parts
+    signed, haze, blob, _ = parts
     mask = KeepMask(BOX, PITCH, ~(haze | blob), {"removed": 3})
     vetoed = apply_veto(mask, veto_of(cameras, render), scene, signed, cameras)
     report = vetoed.summary()["veto"]

@@ -157,7 +157,6 @@ def test_threshold_of_strength():
         assert threshold_of(1.0, advised) > 1.0
 
 
-@pytest.mark.filterwarnings("ignore:clean. .*optical depth is removed")
 def test_nothing_at_all_and_everything_full(kit):
     for level in (0.0, 1e30):
         for predict in (kit.all_empty, kit.all_full):
@@ -170,13 +169,11 @@ def test_nothing_at_all_and_everything_full(kit):
             json.dumps(mask.summary())
 
 
-@pytest.mark.filterwarnings("ignore:clean. .*optical depth is removed")
 def test_a_callable_that_does_not_look_at_its_positions_is_pointed_out(kit):
     with pytest.warns(UserWarning, match="clean: density_fn returned 4 at each of 4500 places"):
         clean(lambda p: np.full(len(p), 4.0), BOX, denoiser=kit.numpy_denoiser(kit.identity), resolution=20)
 
 
-@pytest.mark.filterwarnings("ignore:clean. .*optical depth is removed")
 def test_keep_boxes_are_left_alone(kit):
     box = [[-1.0, -1.0, 0.3], [1.0, 1.0, 0.5]]
     mask = clean(room_density, BOX, denoiser=kit.numpy_denoiser(kit.all_empty), field_pitch=PITCH, keep_boxes=(box,))
@@ -184,7 +181,6 @@ def test_keep_boxes_are_left_alone(kit):
     assert mask.keep(positions).tolist() == [True, False]
 
 
-@pytest.mark.filterwarnings("ignore:clean. .*optical depth is removed")
 def test_a_box_that_the_pitch_does_not_divide(kit):
     box = np.array([[0.0, 0.0, 0.0], [1.0, 0.55, 0.01]])
 

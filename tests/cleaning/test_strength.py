@@ -32,7 +32,6 @@ def slab_lost(mask):
     return 0.01 + float((~mask.keep(places)).mean())
 
 
-@pytest.mark.filterwarnings("ignore:clean. .*optical depth is removed")
 def test_masks_of_any_strength_are_those_of_clean(kit, judgement):
     for strength in (0.0, 0.1, 0.3, 0.45, 0.7, 1.0):
         whole = clean(density_fn, BOX, denoiser=unsure(kit), field_pitch=2 / 32, strength=strength)
