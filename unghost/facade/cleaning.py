@@ -7,16 +7,20 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..cleaning import pipeline, splats
 from ..cleaning.keep_mask import KeepMask
+from ..cleaning.photo_veto import PhotoVeto, Render
 from ..cleaning.pipeline import CleanSettings
 from ..cleaning.splats import REACH, CleanedSplats
 from ..core.cameras import Cameras
+from ..core.errors import InvalidArgument
 from ..core.manifest import Denoiser
+from ..core.sparse_points import SparsePoints
 from ..denoisers import load_denoiser
 from ..splats.ply import Gaussians
+from .choice import choose_denoiser
 
 Progress = Callable[[int, int], None]
 
@@ -26,8 +30,12 @@ def clean(
     aabb: ArrayLike,
     *,
     cameras: Cameras | None = None,
+    points: SparsePoints | None = None,
     denoiser: Denoiser | None = None,
     strength: float | None = None,
+    budget: float | None = None,
+    photos: NDArray[Any] | None = None,
+    render: Render | None = None,
     field_pitch: float | None = None,
     resolution: int | None = None,
     keep_boxes: Sequence[ArrayLike] | None = None,
@@ -40,15 +48,23 @@ def clean(
         density_fn: ``positions (M, 3) float32 -> density (M, 1) or (M,)``, >= 0 per scene unit; it takes and returns
             numpy arrays or torch tensors (which of the two is found out with one point).
         aabb: ``(2, 3)`` smallest and largest corner, scene units; nothing outside it is changed.
-        cameras: of the training photos, for a denoiser that uses view counts (``load_denoiser("views")``); any other
-            ignores them, with a warning.
-        denoiser: from :func:`unghost.load_denoiser`; None loads the shipped default through onnxruntime.
+        cameras: of the training photos.
+        points: sparse points of the training photos (``load_capture(...).points``), in the frame of ``cameras``, whose
+            indices their observations use.
+        denoiser: from :func:`unghost.load_denoiser`, run through onnxruntime. None loads the shipped one that fits what
+            is known (:func:`unghost.facade.choice.choose_denoiser`); ``summary()["denoiser"]`` names it.
         strength: in [0, 1]: 0 removes nothing, 0.5 (the default) uses the denoiser's own threshold, 1 removes
             everything.
+        budget: in (0, 1]: upper limit on the share of the field's optical depth that is removed, most certain cells
+            first; None for no limit. ``summary()["depth_removed_share"]`` says how much went.
+        photos: ``(N, H, W, 3)`` in [0, 1], of ``cameras``, in their order; with ``render``, they veto removals that
+            make them worse (:class:`unghost.cleaning.photo_veto.PhotoVeto`), and justify none.
+        render: ``render(density_fn, index) -> rgb (H, W, 3)``: renders photo ``index`` with the field's colours and
+            the given density callable.
         field_pitch: side of the field's own cells, scene units; None uses 1/128 of the longest side of ``aabb``.
         resolution: cells of the sampling grid along the longest side; None derives it from ``field_pitch``.
         keep_boxes: ``(2, 3)`` boxes, scene units, in which nothing is removed (thin or transparent things).
-        settings: all other settings; the four arguments above replace theirs where given.
+        settings: all other settings; the arguments above replace theirs where given.
         progress: called with (windows done, windows in all).
 
     Returns:
@@ -69,15 +85,20 @@ def clean(
         >>> mask.keep(np.array([[0.0, 0.0, 0.49], [0.8, 0.8, 0.8]])).tolist()
         [True, False]
     """
-    given = {"strength": strength, "field_pitch": field_pitch, "resolution": resolution}
+    if (photos is None) != (render is None):
+        raise InvalidArgument("clean: photos and render must come together, got one of them")
+    veto = None if photos is None or render is None else PhotoVeto(photos, render)
+    given = {"strength": strength, "budget": budget, "field_pitch": field_pitch, "resolution": resolution}
     changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     if keep_boxes is not None:
         changes["keep_boxes"] = tuple(keep_boxes)
     return pipeline.clean(
         density_fn,
         aabb,
-        denoiser=load_denoiser() if denoiser is None else denoiser,
+        denoiser=load_denoiser(choose_denoiser(cameras, points)) if denoiser is None else denoiser,
         cameras=cameras,
+        points=points,
+        veto=veto,
         settings=dataclasses.replace(settings or CleanSettings(), **changes),
         progress=progress,
     )
