@@ -32,13 +32,13 @@ from ...core.shards.packing import (
     unpack_labels,
 )
 from ...core.shards.storage import TRANSMITTANCE_RESOLUTION, read_shard, write_shard
-from ...core.sight_lines import SightLines
 from ...core.visibility.transmittance import TransmittanceMaps
 from ...core.visibility.view_counts import count_views
 from ..engines import Engine, LocalEngine, open_engine
 from ..folder_lock import locked
 from .config import HarvestConfig
 from .context import evidence, signed_opacity, surroundings
+from .evidence import TOGETHER, lines_of, point_sets
 from .labels import HIDDEN, Labeller, Truth, check_fit, severity_of
 from .resume import finished, scene_folder
 from .rooms import draw_objects_of, room_cubes
@@ -50,9 +50,8 @@ if TYPE_CHECKING:
     from ...scenes.generator import PhotographedScene
 
 OBSERVER_STREAM = 0x6F6273  # keeps the other sweep apart from all else
-POINT_STREAM = 0x73666D  # the same for the sparse points
 EARLY = 0.45  # share of the fit at which the first cubes are taken
-TOGETHER, QUERY = 8, 1 << 17  # cubes, and points in them, that are worked on at a time
+QUERY = 1 << 17  # points that are worked on at a time
 
 
 @contextmanager
@@ -116,7 +115,7 @@ def harvest_cubes(
     density_fn = _density_fn(field)
     maps = TransmittanceMaps.build(density_fn, truth.cameras, aabb=field.aabb, field_pitch=field.field_pitch)
     parts: list[dict[str, NDArray[Any]]] = []
-    lines = [SightLines.build(each, truth.cameras, aabb=field.aabb, pitch=field.field_pitch) for each in points]
+    lines = lines_of(list(points), truth.cameras, aabb=field.aabb, pitch=field.field_pitch)
     for number, start in enumerate(range(0, count, TOGETHER)):
         some = slice(start, start + TOGETHER)
         frames = (centers[some], edges[some], rotations[some])
@@ -146,9 +145,10 @@ def harvest_cubes(
     return arrays
 
 
-def _photograph(
+def photograph_scene(
     rng: np.random.Generator, config: HarvestConfig, objects: Sequence[SampledDistance] = ()
 ) -> PhotographedScene:
+    """A random scene in as many photos as the config draws."""
     from ...scenes.generator import photograph, random_scene
 
     width = int(rng.integers(config.photo_width[0], config.photo_width[1] + 1))
@@ -167,13 +167,6 @@ def _draw_field(rng: np.random.Generator, config: HarvestConfig) -> tuple[str, i
     return kind, resolution, make_field(kind, resolution, initial_opacity=opacity, seed=int(rng.integers(2**31)))
 
 
-def _point_sets(rng: np.random.Generator, photographed: PhotographedScene, config: HarvestConfig) -> list[SparsePoints]:
-    """Simulated sparse points, set by set."""
-    from ...scenes.sparse_points import simulate_sparse_points
-
-    return [simulate_sparse_points(rng, photographed) for _ in range(config.point_sets)]
-
-
 @_one_thread()
 def harvest_scene(
     seed: int, index: int, config: HarvestConfig, mesh_root: str | Path | None = None
@@ -190,7 +183,7 @@ def harvest_scene(
 
     rng = np.random.default_rng([seed, index])
     objects, meshes = draw_objects_of(seed, index, config, mesh_root)
-    photographed = _photograph(rng, config, objects)
+    photographed = photograph_scene(rng, config, objects)
     kind, resolution, field = _draw_field(rng, config)
     steps = int(np.exp(rng.uniform(*np.log(config.steps))))
     samples = max(48, round(2.4 / field.field_pitch))
@@ -210,7 +203,7 @@ def harvest_scene(
     parts: list[dict[str, NDArray[Any]]] = []
 
     def cut() -> None:
-        points = _point_sets(np.random.default_rng([seed, index, POINT_STREAM, len(parts)]), photographed, config)
+        points = point_sets(photographed, seed=seed, index=index, snapshot=len(parts), sets=config.point_sets)
         parts.append(harvest_cubes(rng, field, truth, config, points=points))
 
     def snapshot(fitted: TrainableField, step: int) -> None:
