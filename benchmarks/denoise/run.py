@@ -50,6 +50,8 @@ class Options(BenchmarkOptions):
     Attributes:
         meshes: folder of meshes with a manifest.csv.
         harvest: folder of harvested shards of scenes that were not trained on.
+        many, few: the harvest with other sparse points (``point_sets.py``): 3,000 to 10,000, and 300 to 700 that are
+            noisier.
         unseen: the same of a kind of field that was not trained on.
         capture: folder of a real capture.
         models: of those to compare, NAME=FILE (.onnx or .safetensors); ``unghost`` is the shipped one.
@@ -68,11 +70,20 @@ class Options(BenchmarkOptions):
         "seconds": 0.5,
         "fits": (1, 10, 32),
     }
-    DATA: ClassVar[dict[str, str]] = {"meshes": MESHES, "harvest": HARVEST, "unseen": HARVEST, "capture": CAPTURE}
+    DATA: ClassVar[dict[str, str]] = {
+        "meshes": MESHES,
+        "harvest": HARVEST,
+        "many": HARVEST,
+        "few": HARVEST,
+        "unseen": HARVEST,
+        "capture": CAPTURE,
+    }
     SHORT_WITHOUT: ClassVar[tuple[str, ...]] = ("meshes",)
 
     meshes: Path = NOT_GIVEN
     harvest: Path | None = None
+    many: Path | None = None
+    few: Path | None = None
     unseen: Path | None = None
     capture: Path | None = None
     models: tuple[str, ...] = ("unghost=default",)
@@ -141,7 +152,13 @@ def all_sets(options: Options) -> list[CubeSet]:
     """Every set that there is a folder for."""
     meshes = options.meshes if given(options.meshes) else None
     sets = list(mesh_sets(meshes, options.cubes, max(1, options.cubes // 10)))
-    for name, folder in (("harvest", options.harvest), ("harvest-unseen-field", options.unseen)):
+    harvests = {
+        "harvest": options.harvest,
+        "harvest-many-points": options.many,
+        "harvest-few-points": options.few,
+        "harvest-unseen-field": options.unseen,
+    }
+    for name, folder in harvests.items():
         if folder is not None:
             sets.append(harvest_set(name, folder, options.cubes))
     if options.capture is not None:
@@ -222,7 +239,7 @@ def _headline(rows: list[dict[str, Any]], method: str) -> str:
     mean = next(row for row in mine if row.get("severity") == "mean")
     text = f"{method:22s} mixed {mean['iou_before']:.3f} -> {mean['iou']:.3f}"
     for row in mine:
-        if row["set"] in ("harvest", "harvest-unseen-field", "capture"):
+        if row["set"].startswith("harvest") or row["set"] == "capture":
             text += f"  {row['set']} {row['ghosts_removed_98']:.3f}"
         if row["set"] == "clean":
             text += f"  clean {row['iou']:.3f}"

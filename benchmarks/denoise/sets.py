@@ -45,8 +45,8 @@ class CubeSet:
     """Labelled cubes.
 
     Attributes:
-        name: ``clean``, ``bubbles``, ``synthetic``, ``synthetic-soft``, ``harvest``, ``harvest-unseen-field`` or
-            ``capture``.
+        name: ``clean``, ``bubbles``, ``synthetic``, ``synthetic-soft``, ``capture`` or ``harvest`` (``-many-points``,
+            ``-few-points``, ``-unseen-field``).
         about: what tells rows of one set apart: ``family`` and ``severity`` of the corruption.
         signed: ``(N, 32, 32, 32)`` float32 signed opacity.
         labels: ``(N, 32, 32, 32)`` uint8.
