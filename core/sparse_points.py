@@ -208,10 +208,7 @@ class SparsePoints:
             >>> points.filtered(cameras).about.split(", ")[:2]
             ['1 of 2 points dropped: 0 in view of fewer than 2 photos', '1 off by more than 2 pixels']
         """
-        if not most_error > 0:
-            raise InvalidArgument(f"SparsePoints.filtered: most_error must be > 0 pixels, got {most_error}")
-        if not 0 <= least_angle < 180:
-            raise InvalidArgument(f"SparsePoints.filtered: least_angle must be in [0, 180) degrees, got {least_angle}")
+        check_thresholds(most_error, least_angle, caller="SparsePoints.filtered")
         if len(self.camera) and self.camera.max() >= len(cameras):
             raise InvalidArgument(
                 f"SparsePoints.filtered: camera must be < {len(cameras)}, the number of cameras, "
@@ -265,6 +262,18 @@ class FilteredPoints:
             f"{self.large_error} off by more than {self.most_error:g} pixels, "
             f"{self.narrow_angle} seen under less than {self.least_angle:g} degrees"
         )
+
+
+def check_thresholds(most_error: float, least_angle: float, *, caller: str) -> None:
+    """Check the thresholds of :meth:`SparsePoints.filtered`, before the work that leads to points.
+
+    Raises:
+        InvalidArgument: one is out of range.
+    """
+    if not most_error > 0:
+        raise InvalidArgument(f"{caller}: most_error must be > 0 pixels, got {most_error}")
+    if not 0 <= least_angle < 180:
+        raise InvalidArgument(f"{caller}: least_angle must be in [0, 180) degrees, got {least_angle}")
 
 
 def _counted(count: int, noun: str) -> str:

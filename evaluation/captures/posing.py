@@ -18,6 +18,8 @@ from .colmap import quiet_pycolmap
 Progress = Callable[[str, int, int], None]
 EXTRACT_AT_ONCE, MATCH_AT_ONCE = 8, 500  # photos and pairs between two reports of progress
 SMALLEST_PART = 3  # photos
+MATCHING = ("exhaustive", "sequential")
+OVERLAP = 10  # photos, of sequential matching
 NEEDED = (  # of pycolmap 4.2
     *("extract_features", "match_image_pairs", "incremental_mapping", "ImportedPairingOptions", "CameraMode"),
     *("FeatureExtractionOptions", "FeatureMatchingOptions", "ImageReaderOptions", "IncrementalPipelineOptions"),
@@ -218,6 +220,25 @@ def _extract(
     tell("features", total, total)
 
 
+def pairs_to_match(names: Sequence[str], overlap: int | None = None) -> list[tuple[str, str]]:
+    """Pairs of photos: all of them, or those that a sequence makes likely to overlap.
+
+    Args:
+        names: of the photos; for a sequence, in the order in which they were taken.
+        overlap: None for every pair, n (n - 1) / 2 of n photos. A number for sequential matching: each photo with the
+            so many next ones, and with those 2, 4, 8, 16, … further on, which close loops of a walk: about
+            n (overlap + log2(n / overlap)).
+
+    Example:
+        >>> [f"{one}{other}" for one, other in pairs_to_match("abcdef", 1)]
+        ['ab', 'bc', 'cd', 'de', 'ef', 'ac', 'bd', 'ce', 'df', 'ae', 'bf']
+    """
+    if overlap is None:
+        return list(combinations(names, 2))
+    steps = sorted({*range(1, overlap + 1), *(1 << power for power in range(1, len(names).bit_length()))})
+    return [pair for step in steps for pair in zip(names, names[step:])]
+
+
 def match_pairs(
     pycolmap: Any,
     database: Path,
@@ -226,18 +247,20 @@ def match_pairs(
     seed: int,
     threads: int,
     tell: Progress,
+    overlap: int | None = None,
     first: int = 0,
     matched: Callable[[int], None] | None = None,
 ) -> None:
-    """Match every pair of photos by their features, some hundred pairs at a time.
+    """Match pairs of photos by their features, some hundred pairs at a time.
 
     Args:
         pycolmap: the module.
         database: COLMAP's, with the features of all photos; ``pairs.txt`` is written beside it.
-        names: of the photos.
+        names: of the photos, in the order in which they were taken if ``overlap`` is a number.
         seed: of the verification's random choices.
         threads: 0 for one per core.
         tell: called with ``"pairs"``, how many are matched, and how many there are.
+        overlap: None for every pair, else as in :func:`pairs_to_match`.
         first: pairs that are matched already.
         matched: called with the number of matched pairs after each part.
     """
@@ -246,7 +269,7 @@ def match_pairs(
     verification.ransac.random_seed = seed
     chosen = pycolmap.ImportedPairingOptions()
     chosen.match_list_path = database.with_name("pairs.txt")
-    pairs = list(combinations(names, 2))
+    pairs = pairs_to_match(names, overlap)
     for start in range(first, len(pairs), MATCH_AT_ONCE):
         tell("pairs", start, len(pairs))
         lines = (f"{one} {other}\n" for one, other in pairs[start : start + MATCH_AT_ONCE])
