@@ -50,7 +50,7 @@ def capture(
     with StagedProgress("photo", leave=True) as bars:
 
         def progress(stage: str, done: int, total: int) -> None:
-            bars(done, total, stage=stage, unit="pair" if stage == "pairs" else "photo")
+            bars(done, total, stage=stage, unit={"pairs": "pair", "joining": "step"}.get(stage, "photo"))
 
         try:
             told = make_capture(train, evaluation, out, frames=frames, settings=settings, progress=progress)
@@ -62,6 +62,7 @@ def capture(
         print(f"{sweep}: {each['seen']} pictures in {each['source']}, {each['kept']} kept, {each['posed']} posed")
     if told["unposed"]:
         print(f"without a pose, and left out: {', '.join(told['unposed'])}")
+    print(f"poses by {told['mapping']}")
     print(f"reprojection error {told['reprojection_error']:.2f} pixels, {told['points']} points")
     posed, _ = _read(out, None, "error", None)
     _report(posed, *_sweeps(posed, None, None), plot)
