@@ -219,3 +219,25 @@ def test_of_eight_per_cent_wrong_points_hardly_any_stay():
     far = off > 0.3  # of points in a box of 1.4
     assert far.sum() > 20
     assert far[result.kept].sum() < 0.2 * far.sum()  # those left are guesses that came out near the two cameras
+
+
+def test_no_point_one_and_two_in_one_place_go_through_everything():
+    for count in (0, 1, 2):
+        xyz = np.zeros((count, 3))
+        seen = [[number, index] for number in range(count) for index in (0, 1)]
+        point, camera = np.array(seen, dtype=int).reshape(-1, 2).T
+        points = SparsePoints.create(xyz, point=point, camera=camera, cameras=CAMERAS)
+        assert len(points) == count
+        assert points.views().tolist() == [2] * count
+        assert points.angles(CAMERAS).tolist() == pytest.approx([90.0] * count)
+        assert len(points.filtered(CAMERAS).points) == count
+        assert len(points.of(CAMERAS, [1, 0])) == count
+        assert len(points.select(np.ones(count, dtype=bool))) == count
+        assert np.isnan(points.share_in_view(CAMERAS)) == (count == 0)
+
+
+def test_a_point_on_a_cameras_centre_has_no_ray_of_it():
+    points = SparsePoints.create(CAMERAS.origins[:1], point=[0, 0], camera=[0, 1], cameras=CAMERAS)
+    assert points.uncertainty[0] == np.inf
+    result = points.filtered(CAMERAS)
+    assert (len(result.points), result.few_views) == (0, 1)

@@ -211,6 +211,7 @@ def colmap(monkeypatch):
         monkeypatch.setattr(pycolmap, "global_mapping", map_globally)
         return calls
 
+    monkeypatch.setattr(posing_module, "_with_simple_lenses", lambda colmap, database, target: target)
     for step in ("_extract", "match_pairs"):
         monkeypatch.setattr(posing_module, step, lambda *_, **__: None)
     return set_parts
@@ -226,11 +227,11 @@ SPLIT = [["a1", "a2", "a3", "b1"], ["b2", "b3", "a4"]]
             SPLIT,
             [["a1", "a2", "a3", "a4", "b2", "b3"]],
             6,
-            "global mapping, 6 photos; incremental mapping split them into parts of 4 and 3",
+            "global mapping, 6 photos; incremental mapping split them into parts of 4, 3",
         ),
-        (SPLIT, [SPLIT[0]], 4, "incremental mapping, 4 photos of parts of 4 and 3; global mapping joined 4"),
-        (SPLIT, [], 4, "incremental mapping, 4 photos of parts of 4 and 3; global mapping joined 0"),
-        (SPLIT, RuntimeError("no"), 4, "incremental mapping, 4 photos of parts of 4 and 3; global mapping joined 0"),
+        (SPLIT, [SPLIT[0]], 4, "incremental mapping, 4 photos of parts of 4, 3; global mapping joined 4"),
+        (SPLIT, [], 4, "incremental mapping, 4 photos of parts of 4, 3; global mapping joined 0"),
+        (SPLIT, RuntimeError("no"), 4, "incremental mapping, 4 photos of parts of 4, 3; global mapping joined 0"),
         ([SPLIT[0]], [], 4, "incremental mapping, 4 photos"),
     ],
 )
@@ -253,7 +254,7 @@ def test_a_pycolmap_without_global_mapping_does_without(tmp_path, colmap, monkey
     calls = colmap(SPLIT, [["a1"]])
     monkeypatch.delattr(pycolmap, "global_mapping")
     posing = pose_jointly(tmp_path, SWEEPS, out=tmp_path / "out", settings=PosingSettings(minimum_share=0.25))
-    assert posing.mapping.startswith("incremental mapping, 4 photos of parts of 4 and 3")
+    assert posing.mapping.startswith("incremental mapping, 4 photos of parts of 4, 3")
     assert calls == ["incremental"]
 
 
@@ -289,9 +290,12 @@ def test_global_mapping_poses_rendered_sweeps_as_they_were(posed, room, tmp_path
     monkeypatch.setattr(posing_module, "_map", lambda *arguments: write_parts(arguments[3], split))
     settings = PosingSettings(threads=1, minimum_share=0.1)
     posing = pose_jointly(folder / "images", sweeps, out=tmp_path / "sparse" / "0", settings=settings)
-    assert posing.mapping == "global mapping, 14 photos; incremental mapping split them into parts of 3 and 3"
+    assert posing.mapping == "global mapping, 14 photos; incremental mapping split them into parts of 3, 3"
     _, found, poses = read_frames(read_model(tmp_path / "sparse" / "0"), "the model")
     order = [found.index(name) for names in sweeps.values() for name in names]
     distance, angle = room.similarity_error(poses[order], true)
     assert np.median(distance) < 0.02
     assert np.median(angle) < 2
+    lenses = pycolmap.Reconstruction(tmp_path / "sparse" / "0").cameras.values()
+    assert [lens.model.name for lens in lenses] == ["SIMPLE_RADIAL"] * 2
+    np.testing.assert_allclose([lens.mean_focal_length() for lens in lenses], room.FOCAL, rtol=0.03)
