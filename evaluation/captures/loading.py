@@ -127,7 +127,10 @@ class Capture:
         others = sorted(set(image_names(model).values()) - set(names))
         if others:
             raise InvalidFile(f"Capture.points_of: {model} holds photos that are not in {split!r}, such as {others[0]}")
-        return read_points(model, names, self.cameras.select(chosen), transform=self.transform)
+        cameras = self.cameras.select(chosen)
+        points = read_points(model, names, cameras, transform=self.transform)
+        warn_if_not_in_view(points, cameras, caller="Capture.points_of")
+        return points
 
     def photo_size(self, index: int) -> tuple[int, int]:
         """Width and height of a photo as it is read: stored, or upright."""

@@ -349,3 +349,20 @@ def test_without_pycolmap_a_model_names_the_extra_and_a_ply_needs_none(
     with pytest.raises(ImportError, match=r"pip install unghost\[capture\]"):
         _ = capture.points
     assert len(other.points) == 3
+
+
+def test_points_of_a_sweep_whose_poses_have_changed_since_are_warned_of(capture_folder):
+    from unghost.evaluation.captures.points import points_folder
+
+    stored = points_folder(capture_folder, "walk")
+    stored.mkdir(parents=True)
+    for path in (capture_folder / "sparse" / "0").iterdir():
+        text = path.read_text(encoding="utf-8")
+        for name in ("a b.png", "c.png"):
+            text = text.replace(name, f"images/{name}")
+        (stored / path.name).write_text(text.replace("5 0 0 4 9", "5 0 0 -4 9").replace("6 0.2 0.1 5", "6 9 0.1 5"))
+    names = load_capture(capture_folder, downscale=1).names
+    capture = load_capture(capture_folder, downscale=1, splits={"walk": names})
+    with pytest.warns(UserWarning, match=r"Capture\.points_of: only 0% of the observations project"):
+        points = capture.points_of("walk")
+    assert points.views().tolist() == [2, 1]
