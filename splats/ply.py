@@ -16,9 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from ..core.errors import InvalidArgument, InvalidFile
 from ..core.file_kinds import SPLATS, file_kind, not_readable
 from ..core.io import atomic_file
-from ..core.ply_types import PLY_TYPES
+from ..core.ply import MOST_HEADER, Element, parse_header
 
-MOST_HEADER = 1 << 16
 MOST_EXTENT = 1e30
 _NEEDED = ("x", "y", "z", "opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3")
 KEEP_SCORE = "keep_score"
@@ -26,32 +25,6 @@ KEEP_SCORE = "keep_score"
 
 def _no_bytes() -> NDArray[np.uint8]:
     return np.zeros(0, np.uint8)
-
-
-@dataclass(frozen=True)
-class Element:
-    """One element of a PLY header.
-
-    Attributes:
-        name: ``vertex``, ``face``, …
-        count: its rows.
-        dtype: of a row, without its lists.
-        list_bytes: least bytes that the lists of a row take (their lengths); 0 if it has none.
-
-    Example:
-        >>> Element("face", 2, np.dtype([]), 1).least_bytes
-        2
-    """
-
-    name: str
-    count: int
-    dtype: np.dtype[np.void]
-    list_bytes: int
-
-    @property
-    def least_bytes(self) -> int:
-        """Bytes of all rows; more where there are lists."""
-        return self.count * (self.dtype.itemsize + self.list_bytes)
 
 
 @dataclass(frozen=True)
@@ -228,17 +201,12 @@ def read_splat_ply(path: str | Path) -> SplatPly:
 
     with source.open("rb") as stream:
         start = stream.read(MOST_HEADER)
-    end = start.find(b"\nend_header")
-    tail = start[end + 11 : end + 13]
-    if end < 0 or not tail.startswith((b"\n", b"\r\n")):
-        raise refuse("it has no PLY header")
-    begins = end + (12 if tail.startswith(b"\n") else 13)
-    lines = tuple(line.rstrip("\r") for line in start[:end].decode("latin-1").split("\n"))
     try:
-        elements = _elements(lines[1:])
-        place = _place_of_vertices(elements)
+        header = parse_header(start, formats=("binary_little_endian",))
+        place = header.place
     except ValueError as error:
         raise refuse(str(error)) from None
+    elements, begins = header.elements, header.begins
     vertex, others = elements[place], (*elements[:place], *elements[place + 1 :])
     missing = [name for name in _NEEDED if name not in (vertex.dtype.names or ())]
     if missing:
@@ -254,55 +222,12 @@ def read_splat_ply(path: str | Path) -> SplatPly:
     behind = first + vertex.least_bytes
     rows = np.memmap(source, vertex.dtype, "r", first, (vertex.count,)) if vertex.count else np.zeros(0, vertex.dtype)
     return SplatPly(
-        rows, lines, _bytes_of(source, begins, first), _bytes_of(source, behind, source.stat().st_size), others
+        rows, header.lines, _bytes_of(source, begins, first), _bytes_of(source, behind, source.stat().st_size), others
     )
 
 
 def _bytes_of(source: Path, first: int, last: int) -> NDArray[np.uint8]:
     return np.memmap(source, np.uint8, "r", first, (last - first,)) if last > first else _no_bytes()
-
-
-def _elements(lines: tuple[str, ...]) -> tuple[Element, ...]:
-    """The elements of a header, in their order."""
-    order, properties = "", 0
-    found: list[tuple[str, int, list[tuple[str, str]], list[int]]] = []
-    for line in lines:
-        words = line.split()
-        if not words or words[0] in ("comment", "obj_info"):
-            continue
-        properties += words[0] == "property"
-        if words == ["format", "binary_little_endian", "1.0"]:
-            order = "<"
-        elif words[0] == "element" and len(words) == 3 and words[2].isdecimal() and len(found) < 64:
-            found.append((words[1], int(words[2]), [], []))
-        elif words[0] == "property" and len(words) == 3 and words[1] in PLY_TYPES and found and properties <= 512:
-            found[-1][2].append((words[2], f"<{PLY_TYPES[words[1]]}"))
-        elif (
-            words[:2] == ["property", "list"]
-            and len(words) == 5
-            and words[3] in PLY_TYPES
-            and PLY_TYPES.get(words[2], "f")[0] in "iu"
-            and found
-            and properties <= 512
-        ):
-            found[-1][3].append(np.dtype(PLY_TYPES[words[2]]).itemsize)
-        else:
-            raise InvalidFile(f"the header's line {line[:60]!r} (wanted: binary_little_endian, element, property)")
-    if not order or any(len(dict(fields)) != len(fields) for _, _, fields, _ in found):
-        raise InvalidFile("its header names no format, or a property twice")
-    return tuple(Element(name, count, np.dtype(fields), sum(lists)) for name, count, fields, lists in found)
-
-
-def _place_of_vertices(elements: tuple[Element, ...]) -> int:
-    """Index of the element ``vertex``, which has no lists and none before it."""
-    names = [element.name for element in elements]
-    if names.count("vertex") != 1:
-        raise InvalidFile(f"its header must name one element vertex, got {', '.join(names) or 'none'}")
-    place = names.index("vertex")
-    listed = [element.name for element in elements[: place + 1] if element.list_bytes and element.count]
-    if listed:
-        raise InvalidFile(f"element {listed[0]} has a list property; only elements behind vertex may")
-    return place
 
 
 def write_splat_ply(

@@ -46,8 +46,8 @@ def make_capture(
 
     Returns:
         what ``capture.json`` in the folder says: per sweep its ``source``, how many pictures it ``seen`` had, were
-        ``kept`` and ``posed``; ``unposed`` names, ``reprojection_error`` in pixels, ``points``, ``frames`` (what each
-        photo was in its source), ``versions`` and ``seed``.
+        ``kept`` and ``posed``; ``unposed`` names, ``reprojection_error`` in pixels, ``points``, ``mapping`` (which of
+        COLMAP's the poses are from), ``frames`` (what each photo was in its source), ``versions`` and ``seed``.
 
     Raises:
         FileNotFoundError, ValueError, ImportError: of the steps.
@@ -152,6 +152,7 @@ def _told(
         "unposed": list(posing.unposed),
         "reprojection_error": posing.reprojection_error,
         "points": posing.points,
+        "mapping": posing.mapping,
         "seed": how.seed,
         "versions": _check_libraries(sources),
         "frames": {path.name: was for each in taken.values() for path, was in zip(each.paths, each.sources)},

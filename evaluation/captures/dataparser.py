@@ -108,6 +108,19 @@ def applied_motion(meta: Mapping[str, Any], folder: Path) -> NDArray[np.float64]
     return np.diag([scale, scale, scale, 1.0]) @ rigid
 
 
+def applied_scale(meta: Mapping[str, Any], folder: Path) -> float:
+    """The ``applied_scale`` of a ``transforms.json``; 1 if it states none.
+
+    Raises:
+        ValueError: it is not > 0.
+
+    Example:
+        >>> applied_scale({}, Path("capture"))
+        1.0
+    """
+    return _positive(meta.get("applied_scale", 1.0), "applied_scale", folder)
+
+
 def _applied(meta: Mapping[str, Any], folder: Path, *, colmap: bool) -> tuple[NDArray[np.float64], float]:
     applied, before = meta.get("applied_transform"), np.eye(4)
     if applied is None and not colmap and (folder / "colmap" / "sparse" / "0").exists():
@@ -118,7 +131,7 @@ def _applied(meta: Mapping[str, Any], folder: Path, *, colmap: bool) -> tuple[ND
         except (TypeError, ValueError):
             raise InvalidFile(f"load_cameras: applied_transform in {folder} must hold 3 x 4 numbers") from None
         before = _rigid(before, "applied_transform", folder)
-    return before, _positive(meta.get("applied_scale", 1.0), "applied_scale", folder)
+    return before, applied_scale(meta, folder)
 
 
 def _rigid(motion: NDArray[np.float64], key: str, where: str | Path) -> NDArray[np.float64]:

@@ -26,7 +26,7 @@ from .dataparser import applied_motion, find_dataparser, into_the_trained_world,
 from .inria import FILE as INRIA_FILE
 from .inria import cameras_as_frames
 from .photos import RESIZED, find_photos, fit_frames, photo_sizes, read_photo, report_missing
-from .points import points_folder, read_points
+from .points import PLY_KEY, has_points, points_folder, read_point_cloud, read_points
 from .splits import Splits, resolve_splits
 from .transforms import has_split_files, read_frames, read_lens, read_object, read_split_files
 
@@ -79,21 +79,31 @@ class Capture:
 
     @functools.cached_property
     def points(self) -> SparsePoints:
-        """Sparse points of the capture's COLMAP model, in the frame of ``cameras``; read when first asked for.
+        """Sparse points that came with the capture, in the frame of ``cameras``; read when first asked for.
 
+        Those of its COLMAP model, with tracks; without such a model those of ``ply_file_path`` of ``transforms.json``,
+        which have none: they support density near them and give no sight lines (``points.about`` says which they are).
         Beside a ``transforms.json`` the model is the one in ``sparse/0`` (or ``colmap/sparse/0``), moved by the file's
-        ``applied_transform`` and ``applied_scale``. Its points were adjusted with all photos, those of the evaluation
-        too: for anything that is scored, triangulate from the training photos alone.
+        ``applied_transform`` and ``applied_scale``; the points of the PLY are moved already, and are scaled alone, as
+        nerfstudio does. They were adjusted with all photos, those of the evaluation too: for anything that is scored,
+        triangulate from the training photos alone.
 
         Raises:
-            FileNotFoundError: there is no model, or it has no points.
-            ValueError: a broken model.
+            FileNotFoundError: there is neither, or a model without points, or no file where ``ply_file_path`` leads.
+            ValueError: a broken model or PLY file.
         """
         model = find_model(self.folder)
-        if model is None:
-            raise MissingFile(f"Capture.points: {self.folder} has no COLMAP model (sparse/0) with points3D")
-        moved = self.transform @ applied_motion(self.meta, self.folder)
-        points = read_points(model, self.names, self.cameras, transform=moved)
+        if model is not None and has_points(model):
+            moved = self.transform @ applied_motion(self.meta, self.folder)
+            points = read_points(model, self.names, self.cameras, transform=moved)
+        elif self.meta.get(PLY_KEY) is not None:
+            points = read_point_cloud(self.folder, self.meta, self.cameras, transform=self.transform)
+        else:
+            state = "no COLMAP model (sparse/0)" if model is None else f"a COLMAP model without points ({model})"
+            raise MissingFile(
+                f"Capture.points: {self.folder} has {state} and no {PLY_KEY} in transforms.json: run "
+                f"unghost points {self.folder}"
+            )
         warn_if_not_in_view(points, self.cameras, caller="Capture.points")
         return points
 
@@ -117,7 +127,10 @@ class Capture:
         others = sorted(set(image_names(model).values()) - set(names))
         if others:
             raise InvalidFile(f"Capture.points_of: {model} holds photos that are not in {split!r}, such as {others[0]}")
-        return read_points(model, names, self.cameras.select(chosen), transform=self.transform)
+        cameras = self.cameras.select(chosen)
+        points = read_points(model, names, cameras, transform=self.transform)
+        warn_if_not_in_view(points, cameras, caller="Capture.points_of")
+        return points
 
     def photo_size(self, index: int) -> tuple[int, int]:
         """Width and height of a photo as it is read: stored, or upright."""

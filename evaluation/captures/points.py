@@ -1,4 +1,5 @@
-"""Sparse points of a COLMAP model, with their tracks, as :class:`~unghost.core.sparse_points.SparsePoints`.
+"""Sparse points of a COLMAP model, with their tracks, or of a PLY file, without, as
+:class:`~unghost.core.sparse_points.SparsePoints`.
 
 ``points3D`` files are parsed here, with every length checked: pycolmap (3.12) ends the process on one that is cut
 short.
@@ -7,19 +8,25 @@ short.
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...core.cameras import Cameras
 from ...core.errors import InvalidFile, MissingFile
+from ...core.ply import read_ply_vertices
 from ...core.sparse_points import SparsePoints
 from .colmap import OWN, image_names
+from .dataparser import applied_scale
+from .photos import find_photos
+from .transforms import clean_name
 
 HEAD = struct.Struct("<Q3d3BdQ")  # id, xyz, rgb, error, length of the track
+PLY_KEY = "ply_file_path"  # nerfstudio's, of transforms.json
 TRACK_ENTRY = np.dtype([("image", "<u4"), ("keypoint", "<u4")])
 
 
@@ -32,12 +39,14 @@ class Tracks:
         error: ``(P,)`` mean reprojection error, pixels.
         point: ``(M,)`` index into ``xyz``.
         image: ``(M,)`` COLMAP's image id.
+        number: ``(P,)`` COLMAP's point id.
     """
 
     xyz: NDArray[np.float64]
     error: NDArray[np.float64]
     point: NDArray[np.int64]
     image: NDArray[np.int64]
+    number: NDArray[np.uint64]
 
 
 def read_tracks(path: str | Path) -> Tracks:
@@ -58,18 +67,23 @@ def read_tracks(path: str | Path) -> Tracks:
     file = Path(path)
     if not file.is_file():
         raise MissingFile(f"read_tracks: no file {file}")
-    xyz, errors, images = _binary(file) if file.suffix == ".bin" else _text(file)
+    numbers, xyz, errors, images = _binary(file) if file.suffix == ".bin" else _text(file)
     places = np.array(xyz, dtype=np.float64).reshape(-1, 3)
     if not np.isfinite(places).all():
         raise InvalidFile(f"read_tracks: {file} has points whose coordinates are not finite")
     error = np.array(errors, dtype=np.float64)
     point = np.repeat(np.arange(len(places)), [len(track) for track in images])
     image = np.concatenate([np.zeros(0, np.int64), *images]).astype(np.int64)
-    return Tracks(places, np.where(error >= 0, error, np.nan), point, image)  # COLMAP writes -1 for unknown
+    known = np.where(error >= 0, error, np.nan)  # COLMAP writes -1 for unknown
+    return Tracks(places, known, point, image, np.array(numbers, dtype=np.uint64))
 
 
-def _binary(file: Path) -> tuple[list[tuple[float, ...]], list[float], list[NDArray[np.int64]]]:
+_Columns = tuple[list[int], list[tuple[float, ...]], list[float], list[NDArray[np.int64]]]  # id, xyz, error, images
+
+
+def _binary(file: Path) -> _Columns:
     data = file.read_bytes()
+    numbers: list[int] = []
     xyz: list[tuple[float, ...]] = []
     errors: list[float] = []
     images: list[NDArray[np.int64]] = []
@@ -82,21 +96,22 @@ def _binary(file: Path) -> tuple[list[tuple[float, ...]], list[float], list[NDAr
     for number in range(count):
         if at + HEAD.size > len(data):
             raise InvalidFile(f"read_tracks: {file} is cut short in point {number} of {count}")
-        _, x, y, z, _, _, _, error, length = HEAD.unpack_from(data, at)
+        own, x, y, z, _, _, _, error, length = HEAD.unpack_from(data, at)
         at += HEAD.size
         if length * TRACK_ENTRY.itemsize > len(data) - at:
             raise InvalidFile(f"read_tracks: {file} is cut short in the track of point {number} of {count}")
         images.append(np.frombuffer(data, TRACK_ENTRY, length, at)["image"].astype(np.int64))
         at += length * TRACK_ENTRY.itemsize
+        numbers.append(own)
         xyz.append((x, y, z))
         errors.append(error)
     if at != len(data):
         raise InvalidFile(f"read_tracks: {file} has {len(data) - at} bytes after its {count} points")
-    return xyz, errors, images
+    return numbers, xyz, errors, images
 
 
-def _text(file: Path) -> tuple[list[tuple[float, ...]], list[float], list[NDArray[np.int64]]]:
-    xyz, errors, images = [], [], []
+def _text(file: Path) -> _Columns:
+    numbers, xyz, errors, images = [], [], [], []
     with file.open(encoding="utf-8-sig") as stream:
         for number, line in enumerate(stream, 1):
             words = line.split()
@@ -108,12 +123,13 @@ def _text(file: Path) -> tuple[list[tuple[float, ...]], list[float], list[NDArra
                     f"got {len(words)} words"
                 )
             try:
+                numbers.append(int(words[0]))
                 xyz.append(tuple(float(word) for word in words[1:4]))
                 errors.append(float(words[7]))
                 images.append(np.array([int(word) for word in words[8::2]], dtype=np.int64))
             except ValueError:
                 raise InvalidFile(f"read_tracks: line {number} of {file} holds what is no number") from None
-    return xyz, errors, images
+    return numbers, xyz, errors, images
 
 
 def points_folder(folder: str | Path, split: str) -> Path:
@@ -162,6 +178,63 @@ def read_points(
     xyz = tracks.xyz if transform is None else tracks.xyz @ transform[:3, :3].T + transform[:3, 3]
     used = camera >= 0
     return SparsePoints.create(xyz, point=tracks.point[used], camera=camera[used], cameras=cameras, error=tracks.error)
+
+
+def has_points(model: Path) -> bool:
+    """Whether a COLMAP model has a file ``points3D`` with a point in it."""
+    file = model / "points3D.bin"
+    if file.is_file():
+        return file.stat().st_size > 8
+    file = file.with_suffix(".txt")
+    if not file.is_file():
+        return False
+    with file.open("rb") as stream:
+        return any(line.strip() and not line.lstrip(b"\xef\xbb\xbf \t").startswith(b"#") for line in stream)
+
+
+def read_point_cloud(
+    folder: str | Path,
+    meta: Mapping[str, Any],
+    cameras: Cameras,
+    *,
+    transform: NDArray[np.float64] | None = None,
+) -> SparsePoints:
+    """Read the points that ``ply_file_path`` of a ``transforms.json`` names: places alone, without tracks.
+
+    Args:
+        folder: of the file, where the path starts from.
+        meta: what the file says.
+        cameras: in the frame of the result.
+        transform: ``(4, 4)`` from the file's world to that of ``cameras``, a similarity without rotation
+            (``Capture.transform``); None if they are one.
+
+    Returns:
+        Points that support and cross nothing: no observations, and an uncertainty that is not determined (inf).
+
+    Raises:
+        MissingFile: the path leads to no file.
+        InvalidFile: it is no path, or the file cannot be read, has no points, or points that are not finite.
+    """
+    value, where = meta[PLY_KEY], Path(folder)
+    if not isinstance(value, str) or not value:
+        raise InvalidFile(f"Capture.points: {PLY_KEY} of transforms.json in {where} must be a path, got {value!r}")
+    (path,), _ = find_photos([clean_name(value)], where)
+    if path is None:
+        raise MissingFile(
+            f"Capture.points: {PLY_KEY} of transforms.json names {value!r}, which must be a PLY file in {where}: "
+            "there is none; put it there, or remove the key"
+        )
+    # nerfstudio 1.1.5 (nerfstudio_dataparser.py, process_data/colmap_utils.py) writes the PLY with applied_transform
+    # made, as the poses have it, and multiplies what it reads by applied_scale. Rotation and shift are not made again.
+    xyz = read_ply_vertices(path, "x", "y", "z", caller="Capture.points") * applied_scale(meta, where)
+    if not len(xyz):
+        raise InvalidFile(f"Capture.points: {path} ({PLY_KEY}) has no points")
+    bad = int((~np.isfinite(xyz)).any(axis=1).sum())
+    if bad:
+        raise InvalidFile(f"Capture.points: {path} ({PLY_KEY}) has {bad} of {len(xyz)} points that are not finite")
+    return SparsePoints.create(
+        xyz if transform is None else xyz @ transform[:3, :3].T + transform[:3, 3], cameras=cameras
+    )
 
 
 def _positions(known: dict[int, str], names: Sequence[str]) -> dict[int, int]:

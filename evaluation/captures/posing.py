@@ -1,11 +1,11 @@
-"""Joint poses of several sweeps of one scene by COLMAP's incremental mapping (``pip install unghost[capture]``)."""
+"""Joint poses of several sweeps of one scene by COLMAP's incremental or global mapping (``unghost[capture]``)."""
 
 from __future__ import annotations
 
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -18,12 +18,14 @@ from .colmap import quiet_pycolmap
 Progress = Callable[[str, int, int], None]
 EXTRACT_AT_ONCE, MATCH_AT_ONCE = 8, 500  # photos and pairs between two reports of progress
 SMALLEST_PART = 3  # photos
+MATCHING = ("exhaustive", "sequential")
+OVERLAP = 10  # photos, of sequential matching
 NEEDED = (  # of pycolmap 4.2
     *("extract_features", "match_image_pairs", "incremental_mapping", "ImportedPairingOptions", "CameraMode"),
     *("FeatureExtractionOptions", "FeatureMatchingOptions", "ImageReaderOptions", "IncrementalPipelineOptions"),
     *("TwoViewGeometryOptions", "Reconstruction", "Device"),
 )
-STATE, DATABASE, PARTS = "state.json", "database.db", "parts"
+STATE, DATABASE, PARTS, GLOBAL = "state.json", "database.db", "parts", "global"
 
 
 class NotJoinedError(InvalidArgument):
@@ -67,12 +69,14 @@ class Posing:
         unposed: the other photos.
         reprojection_error: mean distance in pixels between a point's projection and the feature it stands for.
         points: how many points were triangulated.
+        mapping: which mapping the poses are from, and why, in one line.
     """
 
     posed: Mapping[str, tuple[str, ...]]
     unposed: tuple[str, ...]
     reprojection_error: float
     points: int
+    mapping: str = "incremental mapping"
 
 
 def pose_jointly(
@@ -86,8 +90,10 @@ def pose_jointly(
 ) -> Posing:
     """Pose the photos of all sweeps in one world: SIFT features, every pair matched, incremental mapping, on the CPU.
 
-    Lenses are OPENCV's with k1, k2, p1, p2; the focal length to begin with comes from EXIF where there is one. Of the
-    parts that COLMAP finds, the one with most photos of those that join all sweeps is kept.
+    Lenses are OPENCV's with k1, k2, p1, p2; the focal length to begin with comes from EXIF where there is one. Where
+    incremental mapping splits the photos into several parts, global mapping is tried too, if pycolmap has it; its
+    lenses are SIMPLE_RADIAL, with k1 alone. Of the parts that COLMAP finds, the one with most photos of those that join
+    all sweeps is kept; of two with equally many, the one of incremental mapping.
 
     Args:
         folder: of the photos.
@@ -135,8 +141,10 @@ def pose_jointly(
             parts = _map(pycolmap, database, Path(folder), Path(scratch, PARTS), len(names), how, tell)
             state.save(poses=True)
         else:
-            stored = [path for path in Path(scratch, PARTS).iterdir() if path.name.isdigit()]
-            parts = [pycolmap.Reconstruction(path) for path in sorted(stored, key=lambda path: int(path.name))]
+            parts = _stored(pycolmap, Path(scratch, PARTS))
+        incremental = len(parts)
+        if incremental > 1:
+            parts += _join(pycolmap, database, Path(folder), Path(scratch, PARTS, GLOBAL), how, state, tell)
         counts = [_posed(part, sweeps) for part in parts]
         enough = [
             number
@@ -145,15 +153,22 @@ def pose_jointly(
         ]
         if not enough:
             kind = NotJoinedError if counts else InvalidArgument
-            raise kind(_complaint(counts, sweeps, how.minimum_share))
+            raise kind(_complaint(counts, sweeps, how.minimum_share, incremental))
         best = max(enough, key=lambda number: sum(map(len, counts[number].values())))
         model, posed = parts[best], counts[best]
+        sizes = [sum(map(len, each.values())) for each in counts]
         Path(out).mkdir(parents=True, exist_ok=True)
         model.write_binary(out)
         model.export_PLY(Path(out, "points3D.ply"))
     found = {name for photos in posed.values() for name in photos}
     unposed = tuple(name for name in names if name not in found)
-    return Posing(posed, unposed, float(model.compute_mean_reprojection_error()), int(model.num_points3D()))
+    return Posing(
+        posed,
+        unposed,
+        float(model.compute_mean_reprojection_error()),
+        int(model.num_points3D()),
+        _mapping(sizes, incremental, best),
+    )
 
 
 def check_pycolmap(pycolmap: Any, *, caller: str) -> Any:
@@ -172,7 +187,7 @@ def check_pycolmap(pycolmap: Any, *, caller: str) -> Any:
 
 
 class _State:
-    """How far the posing in a folder has come: features, number of matched pairs, poses."""
+    """How far the posing in a folder has come: features, matched pairs, poses, and global mapping begun and done."""
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / STATE
@@ -180,10 +195,13 @@ class _State:
         self.features: bool = stored.get("features", False)
         self.pairs: int = stored.get("pairs", 0)
         self.poses: bool = stored.get("poses", False)
+        self.tried: bool = stored.get("tried", False)
+        self.joined: bool = stored.get("joined", False)
 
     def save(self, **changes: Any) -> None:
         vars(self).update(changes)
-        write_json(self._path, {"features": self.features, "pairs": self.pairs, "poses": self.poses})
+        keys = ("features", "pairs", "poses", "tried", "joined")
+        write_json(self._path, {key: getattr(self, key) for key in keys})
 
 
 def _threads(how: PosingSettings) -> int:
@@ -218,6 +236,25 @@ def _extract(
     tell("features", total, total)
 
 
+def pairs_to_match(names: Sequence[str], overlap: int | None = None) -> list[tuple[str, str]]:
+    """Pairs of photos: all of them, or those that a sequence makes likely to overlap.
+
+    Args:
+        names: of the photos; for a sequence, in the order in which they were taken.
+        overlap: None for every pair, n (n - 1) / 2 of n photos. A number for sequential matching: each photo with the
+            so many next ones, and with those 2, 4, 8, 16, … further on, which close loops of a walk: about
+            n (overlap + log2(n / overlap)).
+
+    Example:
+        >>> [f"{one}{other}" for one, other in pairs_to_match("abcdef", 1)]
+        ['ab', 'bc', 'cd', 'de', 'ef', 'ac', 'bd', 'ce', 'df', 'ae', 'bf']
+    """
+    if overlap is None:
+        return list(combinations(names, 2))
+    steps = sorted({*range(1, overlap + 1), *(1 << power for power in range(1, len(names).bit_length()))})
+    return [pair for step in steps for pair in zip(names, names[step:])]
+
+
 def match_pairs(
     pycolmap: Any,
     database: Path,
@@ -226,18 +263,20 @@ def match_pairs(
     seed: int,
     threads: int,
     tell: Progress,
+    overlap: int | None = None,
     first: int = 0,
     matched: Callable[[int], None] | None = None,
 ) -> None:
-    """Match every pair of photos by their features, some hundred pairs at a time.
+    """Match pairs of photos by their features, some hundred pairs at a time.
 
     Args:
         pycolmap: the module.
         database: COLMAP's, with the features of all photos; ``pairs.txt`` is written beside it.
-        names: of the photos.
+        names: of the photos, in the order in which they were taken if ``overlap`` is a number.
         seed: of the verification's random choices.
         threads: 0 for one per core.
         tell: called with ``"pairs"``, how many are matched, and how many there are.
+        overlap: None for every pair, else as in :func:`pairs_to_match`.
         first: pairs that are matched already.
         matched: called with the number of matched pairs after each part.
     """
@@ -246,7 +285,7 @@ def match_pairs(
     verification.ransac.random_seed = seed
     chosen = pycolmap.ImportedPairingOptions()
     chosen.match_list_path = database.with_name("pairs.txt")
-    pairs = list(combinations(names, 2))
+    pairs = pairs_to_match(names, overlap)
     for start in range(first, len(pairs), MATCH_AT_ONCE):
         tell("pairs", start, len(pairs))
         lines = (f"{one} {other}\n" for one, other in pairs[start : start + MATCH_AT_ONCE])
@@ -285,6 +324,85 @@ def _map(
     return [found[number] for number in sorted(found)]
 
 
+def _stored(pycolmap: Any, folder: Path) -> list[Any]:
+    """The reconstructions that a mapping has written, by their numbers."""
+    found = [path for path in folder.iterdir() if path.name.isdigit()] if folder.is_dir() else []
+    return [pycolmap.Reconstruction(path) for path in sorted(found, key=lambda path: int(path.name))]
+
+
+def _join(
+    pycolmap: Any, database: Path, folder: Path, parts: Path, how: PosingSettings, state: _State, tell: Progress
+) -> list[Any]:
+    """Global mapping of all photos, which may join what incremental mapping did not; nothing if it cannot be done."""
+    if not hasattr(pycolmap, "global_mapping") or (state.tried and not state.joined):
+        return []  # where it took the process down before, it would again
+    if not state.joined:
+        shutil.rmtree(parts, ignore_errors=True)
+        parts.mkdir(parents=True)
+        state.save(tried=True)
+        tell("joining", 0, 1)
+        try:
+            simple = _with_simple_lenses(pycolmap, database, parts / DATABASE)
+            with suppress(RuntimeError, ValueError):  # COLMAP's own; the parts of incremental mapping are there
+                pycolmap.global_mapping(simple, folder, parts, options=_global_options(pycolmap, how))
+        except BaseException:
+            state.save(tried=False)
+            raise
+        state.save(joined=True)
+    tell("joining", 1, 1)
+    return _stored(pycolmap, parts)
+
+
+def _with_simple_lenses(pycolmap: Any, database: Path, target: Path) -> Path:
+    """A copy of the database whose lenses are SIMPLE_RADIAL: one focal length, one distortion.
+
+    Global mapping begins with all photos at once, and with the eight parameters of OPENCV it finds nothing, or a third,
+    of photos (skull_flash, focal length 2263 pixels, begun from 1200) of which it poses 65 of 66 with this lens.
+    """
+    shutil.copyfile(database, target)
+    with pycolmap.Database.open(target) as opened:
+        for lens in opened.read_all_cameras():
+            focal, center = lens.mean_focal_length(), (lens.principal_point_x, lens.principal_point_y)
+            simple = pycolmap.Camera(
+                camera_id=lens.camera_id,
+                model="SIMPLE_RADIAL",
+                width=lens.width,
+                height=lens.height,
+                params=[focal, *center, 0.0],
+            )
+            simple.has_prior_focal_length = lens.has_prior_focal_length
+            opened.update_camera(simple)
+    return target
+
+
+def _global_options(pycolmap: Any, how: PosingSettings) -> Any:
+    options = pycolmap.GlobalPipelineOptions(
+        random_seed=how.seed, num_threads=_threads(how), min_model_size=SMALLEST_PART
+    )
+    mapper = options.mapper
+    mapper.random_seed, mapper.num_threads = how.seed, _threads(how)
+    for step in (mapper.rotation_averaging, mapper.global_positioning, mapper.retriangulation):
+        step.random_seed = how.seed
+    mapper.global_positioning.use_gpu = mapper.bundle_adjustment.ceres.use_gpu = False
+    return options
+
+
+def _mapping(sizes: Sequence[int], incremental: int, best: int) -> str:
+    """One line: which mapping the chosen part is from, and what the other one came to.
+
+    Example:
+        >>> _mapping([40, 20, 65], 2, 2)
+        'global mapping, 65 photos; incremental mapping split them into parts of 40, 20'
+    """
+    split = ", ".join(map(str, sizes[:incremental]))
+    if best >= incremental:
+        return f"global mapping, {sizes[best]} photos; incremental mapping split them into parts of {split}"
+    if incremental == 1:
+        return f"incremental mapping, {sizes[best]} photos"
+    joined = max(sizes[incremental:], default=0)
+    return f"incremental mapping, {sizes[best]} photos of parts of {split}; global mapping joined {joined}"
+
+
 def _counted(total: int, tell: Progress) -> Iterator[None]:
     """Tells of one photo more each time it is asked; COLMAP may begin anew, so it stops at the total."""
     done = 0
@@ -300,7 +418,7 @@ def _posed(model: Any, sweeps: Mapping[str, Sequence[str]]) -> dict[str, tuple[s
 
 
 def _complaint(
-    counts: Sequence[Mapping[str, tuple[str, ...]]], sweeps: Mapping[str, Sequence[str]], share: float
+    counts: Sequence[Mapping[str, tuple[str, ...]]], sweeps: Mapping[str, Sequence[str]], share: float, incremental: int
 ) -> str:
     """Why no part will do."""
     told = [", ".join(f"{sweep} {len(posed[sweep])} of {len(sweeps[sweep])}" for sweep in sweeps) for posed in counts]
@@ -310,7 +428,8 @@ def _complaint(
             f"pose_jointly: COLMAP posed no photos ({none}): they must be sharp, show texture, overlap, and be taken "
             "from different places"
         )
-    parts = "; ".join(f"part {number}: {text}" for number, text in enumerate(told, start=1))
+    kinds = ["part" if number < incremental else "by global mapping, part" for number in range(len(told))]
+    parts = "; ".join(f"{kind} {number}: {text}" for number, (kind, text) in enumerate(zip(kinds, told), start=1))
     return (
         f"pose_jointly: no part joins at least {share:.0%} of each sweep. COLMAP posed {parts}. "
         "The sweeps must show the same things from not too different places; more frames may help"

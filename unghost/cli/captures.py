@@ -11,7 +11,8 @@ from tyro.conf import Positional, arg
 
 from ..core.errors import InvalidArgument, MissingExtra
 from ..core.progress import StagedProgress
-from ..evaluation.captures.posing import PosingSettings
+from ..core.sparse_points import LEAST_ANGLE, MOST_ERROR
+from ..evaluation.captures.posing import OVERLAP, PosingSettings
 from .options import given, options_of
 
 if TYPE_CHECKING:
@@ -49,7 +50,7 @@ def capture(
     with StagedProgress("photo", leave=True) as bars:
 
         def progress(stage: str, done: int, total: int) -> None:
-            bars(done, total, stage=stage, unit="pair" if stage == "pairs" else "photo")
+            bars(done, total, stage=stage, unit={"pairs": "pair", "joining": "step"}.get(stage, "photo"))
 
         try:
             told = make_capture(train, evaluation, out, frames=frames, settings=settings, progress=progress)
@@ -61,6 +62,7 @@ def capture(
         print(f"{sweep}: {each['seen']} pictures in {each['source']}, {each['kept']} kept, {each['posed']} posed")
     if told["unposed"]:
         print(f"without a pose, and left out: {', '.join(told['unposed'])}")
+    print(f"poses by {told['mapping']}")
     print(f"reprojection error {told['reprojection_error']:.2f} pixels, {told['points']} points")
     posed, _ = _read(out, None, "error", None)
     _report(posed, *_sweeps(posed, None, None), plot)
@@ -133,6 +135,10 @@ def points(
     photos_of: str = "train",
     out: Path | None = None,
     splits: Path | None = None,
+    matching: Literal["exhaustive", "sequential"] = "exhaustive",
+    overlap: int = OVERLAP,
+    most_error: float = MOST_ERROR,
+    least_angle: float = LEAST_ANGLE,
     longest_side: int = 1600,
     seed: int = 0,
     threads: int = 0,
@@ -147,6 +153,11 @@ def points(
         photos_of: the sweep; all for every photo.
         out: new folder for the COLMAP model; CAPTURE/sparse/unghost-SWEEP if not given.
         splits: JSON of the sweeps, as for convert.
+        matching: exhaustive matches every pair, whatever their number; sequential is for hundreds of photos that stand
+            in the order in which they were taken.
+        overlap: of sequential matching: each photo is matched with so many next ones, and those 2, 4, 8, ... further.
+        most_error: points with a larger mean reprojection error are dropped (pixels of the stored photos).
+        least_angle: points whose rays all meet under a smaller angle are dropped (degrees).
         longest_side: features are looked for in photos shrunk to this many pixels. Smaller is faster.
         seed: of COLMAP's random choices.
         threads: 0 for one per core.
@@ -160,14 +171,27 @@ def points(
     target = out or points_folder(capture, photos_of)
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise InvalidArgument(f"points: {target} is there already: remove it, or choose another --out")
+    dropped: list[str] = []
     with StagedProgress("photo", leave=True) as bars:
 
         def progress(stage: str, done: int, total: int) -> None:
             bars(done, total, stage=stage, unit={"pairs": "pair", "points": "step"}.get(stage))
 
         found = triangulate(
-            posed, chosen, out=target, longest_side=longest_side, seed=seed, threads=threads, progress=progress
+            posed,
+            chosen,
+            out=target,
+            matching=matching,
+            overlap=overlap,
+            most_error=most_error,
+            least_angle=least_angle,
+            longest_side=longest_side,
+            seed=seed,
+            threads=threads,
+            progress=progress,
+            log=dropped.append,
         )
+    print("\n".join(dropped))
     print(f"{len(found)} points, {len(found.point)} observations by {len(chosen)} photos of {photos_of}: {target}")
 
 

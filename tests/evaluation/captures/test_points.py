@@ -36,6 +36,7 @@ def test_both_formats_say_the_same(tmp_path, name):
     assert np.isnan(tracks.error[1])  # COLMAP's -1
     assert tracks.point.tolist() == [0, 0, 1, 1, 1]
     assert tracks.image.tolist() == [3, 1, 3, 3, 9]
+    assert tracks.number.tolist() == [7, 2]
 
 
 def test_a_file_that_is_cut_anywhere_is_refused(tmp_path):
@@ -58,6 +59,7 @@ def test_a_file_that_is_cut_anywhere_is_refused(tmp_path):
         ("1 0 0 0 9 9 9\n", "line 1 of .* got 7 words"),
         ("1 0 0 0 9 9 9 .4 3\n", "got 9 words"),
         ("1 0 0 zero 9 9 9 .4\n", "holds what is no number"),
+        ("one 0 0 0 9 9 9 .4\n", "holds what is no number"),
         ("1 0 0 nan 9 9 9 .4\n", "not finite"),
         ("1 0 0 0 9 9 9 .4 3.5 1\n", "holds what is no number"),
     ],
@@ -179,7 +181,10 @@ def test_beside_transforms_json_they_are_moved_with_it(capture_folder):
 
 def test_without_a_model_or_its_points_the_error_says_what_is_wanted(capture_folder):
     (capture_folder / "sparse" / "0" / "points3D.txt").unlink()
-    with pytest.raises(FileNotFoundError, match=r"no file .*points3D"):
+    with pytest.raises(FileNotFoundError, match=r"a COLMAP model without points .* run unghost points"):
+        _ = load_capture(capture_folder).points
+    (capture_folder / "sparse" / "0" / "points3D.txt").write_text("# Number of points: 0\n\n", encoding="utf-8")
+    with pytest.raises(FileNotFoundError, match="a COLMAP model without points"):
         _ = load_capture(capture_folder).points
     other = capture_folder / "other"
     other.mkdir()
@@ -187,5 +192,177 @@ def test_without_a_model_or_its_points_the_error_says_what_is_wanted(capture_fol
     frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}
     lens = {"w": 32, "h": 24, "fl_x": 30, "fl_y": 30, "cx": 16, "cy": 12}
     (other / "transforms.json").write_text(json.dumps({**lens, "frames": [frame]}))
-    with pytest.raises(FileNotFoundError, match=r"has no COLMAP model \(sparse/0\) with points3D"):
+    with pytest.raises(FileNotFoundError, match=r"has no COLMAP model \(sparse/0\) and no ply_file_path in transforms"):
         _ = load_capture(other).points
+
+
+@pytest.mark.parametrize("place", ["", "sparse", "sparse/0", "colmap/sparse/0", "colmap/sparse"])
+@pytest.mark.parametrize("ending", ["txt", "bin"])
+def test_text_and_binary_models_are_read_wherever_the_poses_are(capture_folder, place, ending):
+    import pycolmap
+
+    source, target = capture_folder / "sparse" / "0", capture_folder / "elsewhere" / place
+    target.mkdir(parents=True, exist_ok=True)
+    (target if place == "" else capture_folder / "elsewhere").joinpath("images").mkdir(exist_ok=True)
+    for path in (capture_folder / "images").iterdir():
+        path.rename(capture_folder / "elsewhere" / "images" / path.name.replace(" ", ""))
+    text = (source / "images.txt").read_text(encoding="utf-8").replace("a b.png", "ab.png")
+    (source / "images.txt").write_text(text.replace("\n\n", "\n1 1 5 2 2 6\n"), encoding="utf-8")
+    points = "5 0 0 4 9 9 9 .5 1 0 2 0\n6 0.2 0.1 5 9 9 9 .5 1 1 2 1\n"
+    (source / "points3D.txt").write_text(points, encoding="utf-8")
+    model = pycolmap.Reconstruction(source)
+    (model.write_text if ending == "txt" else model.write_binary)(target)
+    assert {path.suffix for path in target.glob("points3D*")} == {f".{ending}"}
+    capture = load_capture(capture_folder / "elsewhere", downscale=1, normalize=False)
+    order = np.argsort(capture.points.xyz[:, 0])
+    np.testing.assert_allclose(capture.points.xyz[order], [[0, 0, 4], [0.2, 0.1, 5]])
+    assert capture.points.views().tolist() == [2, 2]
+    assert capture.points.share_in_view(capture.cameras) == 1.0
+
+
+POINTS_IN_VIEW = np.array([[0.0, 0.0, -4.0], [0.5, 0.2, -5.0], [-0.3, 0.1, -3.0]])  # OpenGL cameras look along -Z
+
+
+def write_ply(path, xyz, *, order="<"):
+    name = {"<": "binary_little_endian", ">": "binary_big_endian"}[order]
+    head = ["ply", f"format {name} 1.0", f"element vertex {len(xyz)}", *(f"property float {axis}" for axis in "xyz")]
+    path.write_bytes("\n".join([*head, "end_header", ""]).encode() + np.asarray(xyz).astype(f"{order}f4").tobytes())
+
+
+@pytest.fixture
+def ply_folder(tmp_path):
+    """A transforms.json of two photos that names a PLY of points before them."""
+
+    def make(folder=tmp_path, **extra):
+        folder.mkdir(exist_ok=True)
+        frames = []
+        for number, name in enumerate(("a.png", "b.png")):
+            Image.new("RGB", (32, 24)).save(folder / name)
+            pose = np.eye(4)
+            pose[0, 3] = 0.4 * number
+            frames.append({"file_path": name, "transform_matrix": pose.tolist()})
+        lens = {"w": 32, "h": 24, "fl_x": 20, "fl_y": 20, "cx": 16, "cy": 12}
+        meta = {**lens, "ply_file_path": "sparse.ply", **extra, "frames": frames}
+        (folder / "transforms.json").write_text(json.dumps(meta))
+        write_ply(folder / "sparse.ply", POINTS_IN_VIEW)
+        return folder
+
+    return make
+
+
+@pytest.mark.parametrize("normalize", [True, False])
+def test_ply_file_path_gives_points_without_tracks(ply_folder, normalize):
+    capture = load_capture(ply_folder(), downscale=1, normalize=normalize)
+    points = capture.points
+    expected = POINTS_IN_VIEW @ capture.transform[:3, :3].T + capture.transform[:3, 3]
+    np.testing.assert_allclose(points.xyz, expected, atol=1e-6)
+    assert len(points.point) == len(points.camera) == 0
+    assert points.about == "3 points without tracks: they support density near them and give no sight lines"
+    assert np.isinf(points.uncertainty).all()
+
+
+def test_points_without_tracks_support_and_cross_nothing(ply_folder):
+    from unghost.core.sight_lines import SightLines
+
+    capture = load_capture(ply_folder(), downscale=1, normalize=False)
+    lines = SightLines.build(capture.points, capture.cameras, aabb=[[-1, -1, -6], [1, 1, -1]], pitch=0.25)
+    assert len(lines) == 0
+    assert not lines.crossing_count.any()
+    assert (lines.support(POINTS_IN_VIEW) > 0).all()
+    assert not lines.support(np.array([[0.9, -0.9, -1.5]])).any()
+
+
+def test_a_ply_is_moved_as_nerfstudio_does(ply_folder):
+    """Its points are where ``applied_transform`` has put them; ``applied_scale`` alone is made."""
+    turn = np.array([[0.0, 1, 0, 3], [1, 0, 0, 0], [0, 0, -1, 1]])
+    folder = ply_folder(applied_transform=turn.tolist(), applied_scale=0.5)
+    np.testing.assert_allclose(
+        load_capture(folder, downscale=1, normalize=False).points.xyz, 0.5 * POINTS_IN_VIEW, atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_both_byte_orders_and_paths_of_other_machines(ply_folder, order):
+    folder = ply_folder(ply_file_path="C:\\work\\room\\sparse.ply")
+    write_ply(folder / "sparse.ply", POINTS_IN_VIEW, order=order)
+    np.testing.assert_allclose(load_capture(folder, downscale=1, normalize=False).points.xyz, POINTS_IN_VIEW, atol=1e-6)
+
+
+def test_a_model_with_tracks_wins_over_a_ply(capture_folder):
+    from unghost.evaluation.captures.transforms import write_transforms
+
+    plain = load_capture(capture_folder, downscale=1, normalize=False)
+    write_transforms(
+        capture_folder / "transforms.json", plain.cameras, plain.names, {}, ply_file_path="sparse/0/points3D.ply"
+    )
+    write_ply(capture_folder / "sparse" / "0" / "points3D.ply", [[0.0, 0.0, 4.0]])
+    assert load_capture(capture_folder, downscale=1, normalize=False).points.views().tolist() == [2, 1]
+    (capture_folder / "sparse" / "0" / "points3D.txt").write_text("# none\n", encoding="utf-8")
+    points = load_capture(capture_folder, downscale=1, normalize=False).points
+    assert points.xyz.tolist() == [[0.0, 0.0, 4.0]]
+    assert len(points.point) == 0
+
+
+def test_a_ply_that_is_missing_or_broken_is_named(ply_folder):
+    folder = ply_folder()
+    whole = (folder / "sparse.ply").read_bytes()
+    (folder / "sparse.ply").unlink()
+    capture = load_capture(folder, downscale=1)  # nothing is read before it is asked for
+    with pytest.raises(
+        FileNotFoundError, match=r"ply_file_path of transforms\.json names 'sparse\.ply', which must be"
+    ):
+        _ = capture.points
+    for content, message in [
+        (whole[:-4], r"sparse\.ply is not a PLY file that can be read: its body is 4 bytes shorter"),
+        (b"", "no PLY header"),
+        (whole.replace(b"float y", b"float v"), "lack the properties y"),
+        (whole[:-4] + np.float32(np.nan).tobytes(), r"\(ply_file_path\) has 1 of 3 points that are not finite"),
+    ]:
+        (folder / "sparse.ply").write_bytes(content)
+        with pytest.raises(ValueError, match=message):
+            _ = capture.points
+    write_ply(folder / "sparse.ply", np.zeros((0, 3)))
+    with pytest.raises(ValueError, match=r"\(ply_file_path\) has no points"):
+        _ = capture.points
+
+
+@pytest.mark.parametrize("value", [7, "", ["sparse.ply"]])
+def test_a_ply_file_path_that_is_no_path_is_refused(ply_folder, value):
+    with pytest.raises(ValueError, match=r"ply_file_path of transforms\.json in .* must be a path, got"):
+        _ = load_capture(ply_folder(ply_file_path=value), downscale=1).points
+
+
+def test_a_ply_in_another_frame_is_warned_of(ply_folder):
+    folder = ply_folder()
+    write_ply(folder / "sparse.ply", -POINTS_IN_VIEW)
+    with pytest.warns(UserWarning, match=r"Capture\.points: only 0% of the points are in view of any camera"):
+        _ = load_capture(folder, downscale=1).points
+
+
+def test_without_pycolmap_a_model_names_the_extra_and_a_ply_needs_none(
+    capture_folder, ply_folder, tmp_path, monkeypatch
+):
+    import sys
+
+    capture, other = load_capture(capture_folder, downscale=1), load_capture(ply_folder(tmp_path / "ply"), downscale=1)
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    with pytest.raises(ImportError, match=r"pip install unghost\[capture\]"):
+        _ = capture.points
+    assert len(other.points) == 3
+
+
+def test_points_of_a_sweep_whose_poses_have_changed_since_are_warned_of(capture_folder):
+    from unghost.evaluation.captures.points import points_folder
+
+    stored = points_folder(capture_folder, "walk")
+    stored.mkdir(parents=True)
+    for path in (capture_folder / "sparse" / "0").iterdir():
+        text = path.read_text(encoding="utf-8")
+        for name in ("a b.png", "c.png"):
+            text = text.replace(name, f"images/{name}")
+        (stored / path.name).write_text(text.replace("5 0 0 4 9", "5 0 0 -4 9").replace("6 0.2 0.1 5", "6 9 0.1 5"))
+    names = load_capture(capture_folder, downscale=1).names
+    capture = load_capture(capture_folder, downscale=1, splits={"walk": names})
+    with pytest.warns(UserWarning, match=r"Capture\.points_of: only 0% of the observations project"):
+        points = capture.points_of("walk")
+    assert points.views().tolist() == [2, 1]

@@ -13,7 +13,7 @@ from unghost.evaluation.captures.loading import load_capture
 from unghost.evaluation.captures.posing import PosingSettings, pose_jointly
 from unghost.evaluation.captures.transforms import read_frames
 
-pytest.importorskip("pycolmap")
+pycolmap = pytest.importorskip("pycolmap")
 
 SHARED = Path(__file__).parents[3].parent / "shared" / "data" / "captures" / "snowmiku_plush"
 
@@ -167,3 +167,135 @@ def test_what_was_killed_goes_on_to_the_same_poses(posed, tmp_path, monkeypatch)
     assert [step for step in steps if step[0] == "pairs" and step[1] == 0] == []
     assert "features" not in {stage for stage, _, _ in steps}
     assert steps[-1][0] == "pairs"
+
+
+def model_of(names):
+    """A reconstruction that has poses of these photos and nothing else."""
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(camera_id=1, model="PINHOLE", width=64, height=48, params=np.array([60.0, 60, 32, 24]))
+    )
+    for number, name in enumerate(names, start=1):
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.0, 0.1 * number, 0])), np.array([0.1, 0, 4.0]))
+        model.add_image_with_trivial_frame(pycolmap.Image(name=name, camera_id=1, image_id=number), pose)
+    return model
+
+
+def write_parts(folder, parts):
+    for number, names in enumerate(parts):
+        (folder / str(number)).mkdir(parents=True)
+        model_of(names).write_binary(folder / str(number))
+    return [model_of(names) for names in parts]
+
+
+SWEEPS = {"train": ["a1", "a2", "a3", "a4"], "eval": ["b1", "b2", "b3"]}
+
+
+@pytest.fixture
+def colmap(monkeypatch):
+    """COLMAP's costly steps replaced: ``set(incremental, joined)`` gives the photos of the parts of each mapping."""
+    calls = []
+
+    def set_parts(incremental, joined):
+        def map_globally(database, folder, parts, options):
+            calls.append("global")
+            if isinstance(joined, BaseException):
+                raise joined
+            write_parts(parts, joined)
+
+        def map_incrementally(colmap, database, folder, parts, *_):
+            calls.append("incremental")
+            return write_parts(parts, incremental)
+
+        monkeypatch.setattr(posing_module, "_map", map_incrementally)
+        monkeypatch.setattr(pycolmap, "global_mapping", map_globally)
+        return calls
+
+    monkeypatch.setattr(posing_module, "_with_simple_lenses", lambda colmap, database, target: target)
+    for step in ("_extract", "match_pairs"):
+        monkeypatch.setattr(posing_module, step, lambda *_, **__: None)
+    return set_parts
+
+
+SPLIT = [["a1", "a2", "a3", "b1"], ["b2", "b3", "a4"]]
+
+
+@pytest.mark.parametrize(
+    ("incremental", "joined", "posed", "line"),
+    [
+        (
+            SPLIT,
+            [["a1", "a2", "a3", "a4", "b2", "b3"]],
+            6,
+            "global mapping, 6 photos; incremental mapping split them into parts of 4, 3",
+        ),
+        (SPLIT, [SPLIT[0]], 4, "incremental mapping, 4 photos of parts of 4, 3; global mapping joined 4"),
+        (SPLIT, [], 4, "incremental mapping, 4 photos of parts of 4, 3; global mapping joined 0"),
+        (SPLIT, RuntimeError("no"), 4, "incremental mapping, 4 photos of parts of 4, 3; global mapping joined 0"),
+        ([SPLIT[0]], [], 4, "incremental mapping, 4 photos"),
+    ],
+)
+def test_of_both_mappings_the_one_with_more_photos_is_taken_and_said(
+    tmp_path, colmap, incremental, joined, posed, line
+):
+    calls = colmap(incremental, joined)
+    how = PosingSettings(minimum_share=0.25)
+    posing = pose_jointly(tmp_path, SWEEPS, out=tmp_path / "out", settings=how, work=tmp_path)
+    assert sum(map(len, posing.posed.values())) == posed
+    assert posing.mapping == line
+    assert calls == ["incremental", "global"][: len(incremental)]
+    assert pycolmap.Reconstruction(tmp_path / "out").num_reg_images() == posed
+    again = pose_jointly(tmp_path, SWEEPS, out=tmp_path / "out", settings=how, work=tmp_path)
+    assert (again.posed, again.mapping) == (posing.posed, posing.mapping)
+    assert len(calls) == len(incremental)  # both are stored
+
+
+def test_a_pycolmap_without_global_mapping_does_without(tmp_path, colmap, monkeypatch):
+    calls = colmap(SPLIT, [["a1"]])
+    monkeypatch.delattr(pycolmap, "global_mapping")
+    posing = pose_jointly(tmp_path, SWEEPS, out=tmp_path / "out", settings=PosingSettings(minimum_share=0.25))
+    assert posing.mapping.startswith("incremental mapping, 4 photos of parts of 4, 3")
+    assert calls == ["incremental"]
+
+
+def test_parts_of_both_mappings_are_told_apart_where_none_will_do(tmp_path, colmap):
+    colmap(SPLIT, [["a1", "a2", "a3", "a4"]])
+    with pytest.raises(
+        ValueError, match=r"part 1: train 3 of 4, eval 1 of 3; .*by global mapping, part 3: train 4 of 4"
+    ):
+        pose_jointly(tmp_path, SWEEPS, out=tmp_path / "out", settings=PosingSettings(minimum_share=0.9))
+
+
+def test_an_interrupted_global_mapping_is_begun_again_and_one_that_took_the_process_down_is_not(tmp_path, colmap):
+    how = {"out": tmp_path / "out", "settings": PosingSettings(minimum_share=0.25), "work": tmp_path}
+    colmap(SPLIT, KeyboardInterrupt())
+    with pytest.raises(KeyboardInterrupt):
+        pose_jointly(tmp_path, SWEEPS, **how)
+    assert not (tmp_path / "out").exists()
+    calls = colmap(SPLIT, [["a1", "a2", "a3", "a4", "b1"]])
+    assert pose_jointly(tmp_path, SWEEPS, **how).mapping.startswith("global mapping, 5 photos")
+    state = posing_module._State(tmp_path)
+    state.save(tried=True, joined=False)  # as a killed process leaves it
+    before = len(calls)
+    assert pose_jointly(tmp_path, SWEEPS, **how).mapping.startswith("incremental mapping, 4 photos")
+    assert len(calls) == before
+
+
+@pytest.mark.slow
+def test_global_mapping_poses_rendered_sweeps_as_they_were(posed, room, tmp_path, monkeypatch):
+    if not hasattr(pycolmap, "global_mapping"):
+        pytest.skip("this pycolmap has no global mapping")
+    folder, sweeps, true, *_ = posed
+    split = [names[:3] for names in sweeps.values()]
+    monkeypatch.setattr(posing_module, "_map", lambda *arguments: write_parts(arguments[3], split))
+    settings = PosingSettings(threads=1, minimum_share=0.1)
+    posing = pose_jointly(folder / "images", sweeps, out=tmp_path / "sparse" / "0", settings=settings)
+    assert posing.mapping == "global mapping, 14 photos; incremental mapping split them into parts of 3, 3"
+    _, found, poses = read_frames(read_model(tmp_path / "sparse" / "0"), "the model")
+    order = [found.index(name) for names in sweeps.values() for name in names]
+    distance, angle = room.similarity_error(poses[order], true)
+    assert np.median(distance) < 0.02
+    assert np.median(angle) < 2
+    lenses = pycolmap.Reconstruction(tmp_path / "sparse" / "0").cameras.values()
+    assert [lens.model.name for lens in lenses] == ["SIMPLE_RADIAL"] * 2
+    np.testing.assert_allclose([lens.mean_focal_length() for lens in lenses], room.FOCAL, rtol=0.03)
