@@ -1,24 +1,64 @@
-"""Cells of a regular grid that line segments pass through."""
+"""Cells of a regular grid that line segments pass through. Lengths are in cells: the grid is ``[0, shape]``."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
-LINES_AT_ONCE = 4096
+LINES_AT_ONCE = 2048  # what they cross fits in a core's cache
+CELLS_AT_ONCE = 1 << 22  # counted together: each count goes once over the block
 THREADS = 2
+LEAST_IN_THREADS = 8192  # lines
 
 
-def clip_segments(
+@dataclass(frozen=True)
+class Block:
+    """The part ``low <= cell < low + shape`` of a grid: arrays over it say nothing of the rest, which is empty.
+
+    Attributes:
+        low: ``(3,)`` its lowest cell.
+        shape: its number of cells along each axis.
+        grid_shape: that of the grid.
+
+    Example:
+        >>> block = Block.around(np.array([[5.5, 1.0, 0.2], [6.5, 1.0, 0.2]]), (9, 9, 9), reach=1)
+        >>> block.low.tolist(), block.shape
+        ([4, 0, 0], (4, 3, 2))
+    """
+
+    low: IntArray
+    shape: tuple[int, ...]
+    grid_shape: tuple[int, ...]
+
+    @classmethod
+    def around(cls, places: FloatArray, grid_shape: tuple[int, ...], *, reach: int) -> Block:
+        """Smallest block with all cells within ``reach`` cells of ``places (N, 3)``, as far as the grid goes."""
+        size = np.array(grid_shape)
+        if not len(places):
+            return cls(np.zeros(3, dtype=np.int64), (1, 1, 1), grid_shape)
+        low = np.clip(np.floor(places.min(axis=0)) - reach, 0, size - 1).astype(np.int64)
+        high = np.clip(np.floor(places.max(axis=0)) + reach + 1, low + 1, size).astype(np.int64)
+        return cls(low, tuple(int(side) for side in high - low), grid_shape)
+
+    def whole(self, values: NDArray[Any]) -> NDArray[Any]:
+        """``values`` of the block as an array over the grid, 0 elsewhere."""
+        result = np.zeros(self.grid_shape, dtype=values.dtype)
+        result[tuple(slice(low, low + side) for low, side in zip(self.low.tolist(), self.shape))] = values
+        return result
+
+
+def segment_shares(
     starts: FloatArray, ends: FloatArray, shape: tuple[int, ...]
 ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-    """The parts of segments within the grid ``[0, shape]``, in cells, and which segments have one."""
+    """Where segments ``(L, 3)`` enter and leave the grid, as shares of their length, and which of them meet it."""
     along = ends - starts
     with np.errstate(divide="ignore", invalid="ignore"):
         low, high = -starts / along, (np.array(shape, dtype=float) - starts) / along
@@ -27,84 +67,129 @@ def clip_segments(
     leave = np.where(parallel, np.where(within, np.inf, -np.inf), np.maximum(low, high)).min(axis=1)
     enter, leave = np.maximum(enter, 0.0), np.minimum(leave, 1.0)
     meets: NDArray[np.bool_] = enter < leave
-    first, last = (starts[meets] + share[meets, None] * along[meets] for share in (enter, leave))
+    return enter, leave, meets
+
+
+def clip_segments(
+    starts: FloatArray, ends: FloatArray, shape: tuple[int, ...]
+) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+    """The parts of segments ``(L, 3)`` within the grid, and which segments have one."""
+    enter, leave, meets = segment_shares(starts, ends, shape)
+    along = ends[meets] - starts[meets]
+    first, last = (starts[meets] + share[meets, None] * along for share in (enter, leave))
     return first, last, meets
 
 
 class GridTraversal:
-    """Segments ``(L, 3)`` within a grid of cells, in cells."""
+    """Segments ``(L, 3)`` within a block of a grid. A segment of no length passes through the cell that it is in."""
 
-    def __init__(self, shape: tuple[int, ...], starts: FloatArray, ends: FloatArray) -> None:
-        self.shape, self.size = shape, int(np.prod(shape))
-        self.starts, self.ends = starts, ends
+    def __init__(self, block: Block, starts: FloatArray, ends: FloatArray) -> None:
+        self.block, self.starts, self.ends = block, starts, ends
 
-    def count(self, chosen: NDArray[np.bool_]) -> NDArray[np.int64]:
-        """How many of the chosen segments ``(L,)`` pass through each cell."""
-        lines = np.flatnonzero(chosen)
+    def count(self, chosen: NDArray[np.bool_]) -> IntArray:
+        """How many of the chosen segments ``(L,)`` pass through each cell of the block."""
+        size = int(np.prod(self.block.shape))
 
-        def counted(part: NDArray[np.int64]) -> NDArray[np.int64]:
-            total = np.zeros(self.size, dtype=np.int64)
-            for start in range(0, len(part), LINES_AT_ONCE):
-                for _, cells in self._crossed(part[start : start + LINES_AT_ONCE]):
-                    total += np.bincount(cells, minlength=self.size)
-            return total
+        def counted(lines: IntArray) -> IntArray:
+            total, held, number = np.zeros(size, dtype=np.int64), list[IntArray](), 0
+            for _, cells, _ in self._crossed(lines):
+                held.append(cells)
+                number += len(cells)
+                if number > CELLS_AT_ONCE:
+                    total += np.bincount(np.concatenate(held), minlength=size)
+                    held, number = [], 0
+            return total + np.bincount(np.concatenate(held), minlength=size) if held else total
 
-        return np.sum(_in_threads(counted, lines), axis=0).reshape(self.shape)
+        parts = _in_threads(counted, np.flatnonzero(chosen))
+        return np.sum(parts, axis=0).reshape(self.block.shape) if len(parts) > 1 else parts[0].reshape(self.block.shape)
 
     def hit(self, marked: NDArray[np.bool_], *, short_of: float) -> NDArray[np.bool_]:
-        """Which segments ``(L,)`` pass through a marked cell farther than ``short_of`` cells from their end."""
+        """Which segments ``(L,)`` pass through a marked cell farther than ``short_of`` cells from their end.
+
+        Args:
+            marked: over the cells of the block.
+        """
         along = self.ends - self.starts
         length = np.linalg.norm(along, axis=1)
         share = np.maximum(1.0 - short_of / np.maximum(length, 1e-300), 0.0)
         long = share > 0
         result = np.zeros(len(along), dtype=bool)
-        part = GridTraversal(self.shape, self.starts[long], (self.starts + share[:, None] * along)[long])
+        part = GridTraversal(self.block, self.starts[long], (self.starts + share[:, None] * along)[long])
         result[long] = part._hit(marked)
         return result
 
     def _hit(self, marked: NDArray[np.bool_]) -> NDArray[np.bool_]:
         flat, result = marked.ravel(), np.zeros(len(self.starts), dtype=bool)
 
-        def mark(part: NDArray[np.int64]) -> None:
-            for start in range(0, len(part), LINES_AT_ONCE):
-                lines = part[start : start + LINES_AT_ONCE]
-                for line, cells in self._crossed(lines):
-                    result[lines[line[flat[cells]]]] = True
+        def mark(part: IntArray) -> None:
+            for lines, cells, until in self._crossed(part):
+                result[lines[np.searchsorted(until, np.flatnonzero(flat[cells]), side="right")]] = True
 
         _in_threads(mark, np.arange(len(self.starts)))
         return result
 
-    def _crossed(self, lines: NDArray[np.int64]) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-        """Positions in ``lines`` and flat indices of the cells that those segments pass through, each cell once.
+    def _crossed(self, lines: IntArray) -> Iterator[tuple[IntArray, IntArray, IntArray]]:
+        """The cells that segments pass through, each cell once, some lines and one direction of faces at a time.
 
         A segment enters a cell through one face. So the cells are the one it starts in and, for every grid plane that
         it crosses, the one behind that plane (Amanatides and Woo 1987, without the order along the segment).
+
+        Yields:
+            Lines ``(l,)``, flat indices of cells of the block ``(c,)``, line by line, and ``(l,)`` where in these the
+            cells of each line end.
         """
-        start, end = self.starts[lines], self.ends[lines]
-        along, top = end - start, np.array(self.shape) - 1
-        stride = np.array([self.shape[1] * self.shape[2], self.shape[2], 1])
-        first = np.clip(np.floor(start).astype(np.int64), 0, top)
-        last = np.clip(np.floor(end).astype(np.int64), 0, top)
-        found = [(np.arange(len(lines)), first @ stride)]
-        for axis in range(3):
-            steps = np.abs(last[:, axis] - first[:, axis])
-            line = np.repeat(np.arange(len(lines)), steps)
-            number = np.arange(len(line)) - np.repeat(np.cumsum(steps) - steps, steps)
-            up = last[:, axis] > first[:, axis]
-            entered = first[line, axis] + np.where(up, 1, -1)[line] * (number + 1)
-            share = (entered + np.where(up, 0, 1)[line] - start[line, axis]) / along[line, axis]
-            cells = entered * stride[axis]
-            for other in {0, 1, 2} - {axis}:
-                place = (start[line, other] + share * along[line, other]).astype(np.int64)  # >= 0: truncated is floored
-                cells += np.clip(place, 0, top[other]) * stride[other]
-            found.append((line, cells))
-        return found
+        low, most = self.block.low, self.block.low + np.array(self.block.shape) - 1
+        stride = [self.block.shape[1] * self.block.shape[2], self.block.shape[2], 1]
+        corner = int(low @ stride)
+        for begin in range(0, len(lines), LINES_AT_ONCE):
+            some = lines[begin : begin + LINES_AT_ONCE]
+            start, end = np.ascontiguousarray(self.starts[some].T), np.ascontiguousarray(self.ends[some].T)
+            first, last = (np.clip(np.floor(each), low[:, None], most[:, None]) for each in (start, end))
+            yield some, (stride @ first).astype(np.int64) - corner, np.arange(1, len(some) + 1)
+            for axis in range(3):
+                cells, until = _entered(axis, start, end - start, first, last, most, stride)
+                cells -= corner
+                yield some, cells, until
 
 
-def _in_threads(call: Callable[[NDArray[np.int64]], Any], lines: NDArray[np.int64]) -> list[Any]:
+def _entered(
+    axis: int,
+    start: FloatArray,
+    along: FloatArray,
+    first: FloatArray,
+    last: FloatArray,
+    most: IntArray,
+    stride: list[int],
+) -> tuple[IntArray, IntArray]:
+    """Flat cells behind the planes across ``axis`` that lines ``(3, l)`` cross, and where those of each line end.
+
+    All that is per line is repeated, which is far quicker than to gather it.
+    """
+    steps = np.abs(last[axis] - first[axis]).astype(np.int64)
+    until, up = np.cumsum(steps), last[axis] > first[axis]
+    sign = np.where(up, 1.0, -1.0)
+    entered = np.arange(until[-1], dtype=np.float64)  # whole numbers: exact
+    entered *= np.repeat(sign, steps)
+    entered += np.repeat(first[axis] + sign * (1 - (until - steps)), steps)
+    share = entered + np.repeat(np.where(up, 0.0, 1.0), steps)  # the plane
+    share -= np.repeat(start[axis], steps)
+    share /= np.repeat(along[axis], steps)
+    cells = entered.astype(np.int64)
+    cells *= stride[axis]
+    for other in {0, 1, 2} - {axis}:
+        place = np.repeat(along[other], steps)
+        place *= share
+        place += np.repeat(start[other], steps)
+        cell = place.astype(np.int64)  # >= 0: truncated is floored
+        np.minimum(cell, most[other], out=cell)
+        cell *= stride[other]
+        cells += cell
+    return cells, until
+
+
+def _in_threads(call: Callable[[IntArray], Any], lines: IntArray) -> list[Any]:
     """Call with interleaved parts of ``lines``, a thread each; numpy's loops run side by side."""
-    parts = [lines[index::THREADS] for index in range(THREADS)]
-    if len(lines) < 2 * LINES_AT_ONCE:
+    if len(lines) < LEAST_IN_THREADS:
         return [call(lines)]
     with ThreadPoolExecutor(THREADS) as pool:
-        return list(pool.map(call, parts))
+        return list(pool.map(call, [lines[index::THREADS] for index in range(THREADS)]))
