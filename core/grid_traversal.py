@@ -14,7 +14,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 LINES_AT_ONCE = 2048  # what they cross fits in a core's cache
-CELLS_AT_ONCE = 1 << 22  # counted together: each count goes once over the block
+CELLS_AT_ONCE = 1 << 22  # counted together, as each count goes once over the whole block
 THREADS = 2
 LEAST_IN_THREADS = 8192  # lines
 
@@ -50,9 +50,19 @@ class Block:
 
     def whole(self, values: NDArray[Any]) -> NDArray[Any]:
         """``values`` of the block as an array over the grid, 0 elsewhere."""
-        result = np.zeros(self.grid_shape, dtype=values.dtype)
-        result[tuple(slice(low, low + side) for low, side in zip(self.low.tolist(), self.shape))] = values
+        return self.moved(values, Block(np.zeros(3, dtype=np.int64), self.grid_shape, self.grid_shape))
+
+    def moved(self, values: NDArray[Any], to: Block) -> NDArray[Any]:
+        """``values`` of the block as an array over another of the same grid, 0 where only that one has cells."""
+        low = np.maximum(self.low, to.low)
+        high = np.maximum(np.minimum(self.low + np.array(self.shape), to.low + np.array(to.shape)), low)
+        result = np.zeros(to.shape, dtype=values.dtype)
+        result[_slices(low - to.low, high - to.low)] = values[_slices(low - self.low, high - self.low)]
         return result
+
+
+def _slices(low: IntArray, high: IntArray) -> tuple[slice, ...]:
+    return tuple(slice(begin, end) for begin, end in zip(low.tolist(), high.tolist()))
 
 
 def segment_shares(
@@ -95,13 +105,19 @@ class GridTraversal:
             for _, cells, _ in self._crossed(lines):
                 held.append(cells)
                 number += len(cells)
-                if number > CELLS_AT_ONCE:
+                if number > max(CELLS_AT_ONCE, size // 2):
                     total += np.bincount(np.concatenate(held), minlength=size)
                     held, number = [], 0
-            return total + np.bincount(np.concatenate(held), minlength=size) if held else total
+            if number > size // 8:
+                total += np.bincount(np.concatenate(held), minlength=size)
+            elif number:  # does not go over the whole block, but holds other threads up
+                np.add.at(total, np.concatenate(held), 1)
+            return total
 
         parts = _in_threads(counted, np.flatnonzero(chosen))
-        return np.sum(parts, axis=0).reshape(self.block.shape) if len(parts) > 1 else parts[0].reshape(self.block.shape)
+        for part in parts[1:]:
+            parts[0] += part
+        return parts[0].reshape(self.block.shape)
 
     def hit(self, marked: NDArray[np.bool_], *, short_of: float) -> NDArray[np.bool_]:
         """Which segments ``(L,)`` pass through a marked cell farther than ``short_of`` cells from their end.
@@ -132,7 +148,8 @@ class GridTraversal:
         """The cells that segments pass through, each cell once, some lines and one direction of faces at a time.
 
         A segment enters a cell through one face. So the cells are the one it starts in and, for every grid plane that
-        it crosses, the one behind that plane (Amanatides and Woo 1987, without the order along the segment).
+        it crosses, the one behind that plane (Amanatides and Woo 1987, without the order along the segment). Through an
+        edge of cells, to rounding, it may pass through either of two cells, or neither of them is found.
 
         Yields:
             Lines ``(l,)``, flat indices of cells of the block ``(c,)``, line by line, and ``(l,)`` where in these the

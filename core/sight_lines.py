@@ -44,8 +44,9 @@ class SightLines:
             weight that is 1 at the point and 0 from ``REACH`` cells on, along each axis.
         aabb: ``(2, 3)`` box of the grid, scene units.
         pitch: side of its cells, scene units.
-        block: the part of the grid that holds all lines and points; memory and time go with it, not with the box.
-        crossed, supported: ``crossing_count`` and ``support_sum`` of the block.
+        crossed, crossed_block: ``crossing_count`` of the part of the grid that holds all lines; memory and time go with
+            what it holds, not with the box.
+        supported, supported_block: the same of ``support_sum`` and the points.
         shells: the same for boxes that are twice as wide each, without what the next smaller one holds; empty unless
             ``reach`` > 1.
         far_starts, far_targets: ``(F, 3)`` cameras of, and points at the end of, lines that end in the shells.
@@ -67,8 +68,9 @@ class SightLines:
     ends: FloatArray
     targets: FloatArray
     crossed: NDArray[np.int32]
+    crossed_block: Block
     supported: NDArray[np.float32]
-    block: Block
+    supported_block: Block
     aabb: FloatArray
     pitch: float
     shells: tuple[SightLines, ...] = ()
@@ -169,24 +171,27 @@ class SightLines:
         observation = observation[which]
         owner, places = points.point[observation], (points.xyz - origin) / pitch
         here = np.ones(len(points), dtype=bool) if inner is None else ~_within(points.xyz, inner)
-        block = _occupied(starts, ends, places, shape)
+        block = Block.around(np.concatenate([starts, ends]), shape, reach=1)
+        around = Block.around(places[_near(places, shape, SURFACE_REACH)], shape, reach=SURFACE_REACH + 1)
         grid, kept = GridTraversal(block, starts, ends), np.ones(len(starts), dtype=bool)
         count, right = grid.count(kept), votes.right
         if votes.robust:
             views = points.views().astype(float) * right
-            wrong = here & _outnumbered(places, count, _tents(places, block, weights=views, reach=SURFACE_REACH), block)
-            right &= ~wrong
+            near = _tents(places, around, weights=views, reach=SURFACE_REACH)
+            right &= ~(here & _outnumbered(places, block.moved(count, around), near, around))
             count -= grid.count(~right[owner])
-            surface = _tents(places[right], block, weights=views[right], reach=SURFACE_REACH)
-            kept = right[owner] & ~grid.hit(np.greater(surface, np.maximum(count, 1)), short_of=SURFACE_REACH)
+            surface = _tents(places[right], around, weights=views[right], reach=SURFACE_REACH)
+            surface = np.greater(surface, np.maximum(block.moved(count, around), 1))
+            kept = right[owner] & ~grid.hit(around.moved(surface, block), short_of=SURFACE_REACH)
             votes.kept[observation[~kept]] = False
             kept = votes.kept[observation]
             count -= grid.count(right[owner] & ~kept)
         report["outvoted"] = _number_of(observation[~kept], len(points.point))
-        support = _tents(places[right & here], block)
+        support = _tents(places[right & here], around)
         starts, ends = (origin + each[kept] * pitch for each in (starts, ends))
         targets = points.xyz[owner[kept]]
-        return cls(starts, ends, targets, count.astype(np.int32), support, block, box, float(pitch), report=report)
+        crossed = count.astype(np.int32)
+        return cls(starts, ends, targets, crossed, block, support, around, box, float(pitch), report=report)
 
     def __len__(self) -> int:
         """Number of segments, those of the shells too."""
@@ -195,12 +200,12 @@ class SightLines:
     @functools.cached_property
     def crossing_count(self) -> NDArray[np.int32]:
         """``(X, Y, Z)`` int32, how many segments pass through each cell."""
-        return self.block.whole(self.crossed)
+        return self.crossed_block.whole(self.crossed)
 
     @functools.cached_property
     def support_sum(self) -> NDArray[np.float32]:
         """``(X, Y, Z)`` float32 at the cells' centres, how many points lie near."""
-        return self.block.whole(self.supported)
+        return self.supported_block.whole(self.supported)
 
     def crossings(self, positions: NDArray[Any]) -> NDArray[np.float32]:
         """Sight lines through the neighbourhood of ``positions (..., 3)``, relative to a typical crossed cell.
@@ -281,16 +286,16 @@ class SightLines:
         return targets, along / np.linalg.norm(along, axis=1, keepdims=True)
 
     @functools.cached_property
-    def _crossings(self) -> tuple[NDArray[np.float32], Any]:
-        """Over the block, and what to divide by."""
+    def _crossings(self) -> tuple[Block, NDArray[np.float32], Any]:
+        """Values over a block, and what to divide by."""
         present = self.crossed[self.crossed > 0]
-        return self.crossed.astype(np.float32), present.mean() if len(present) else None
+        return self.crossed_block, self.crossed.astype(np.float32), present.mean() if len(present) else None
 
     @functools.cached_property
-    def _support(self) -> tuple[NDArray[np.float32], Any]:
+    def _support(self) -> tuple[Block, NDArray[np.float32], Any]:
         """As :meth:`_crossings`."""
         present = self.supported[self.supported > 0]
-        return self.supported, present.mean() if len(present) else None
+        return self.supported_block, self.supported, present.mean() if len(present) else None
 
     def _look_up(self, name: str, positions: NDArray[Any]) -> NDArray[np.float32]:
         places = np.asarray(positions, dtype=np.float64)
@@ -307,15 +312,15 @@ class SightLines:
         self, name: str, places: FloatArray, inside: BoolArray, index: NDArray[np.int64], result: NDArray[np.float32]
     ) -> None:
         """Write the values at ``places[inside]`` to ``result[index[inside]]``; what no block holds stays 0."""
-        values, typical = getattr(self, name)
+        block, values, typical = getattr(self, name)
         if typical is None:
             return
-        origin = lattice_origin(self.aabb, self.pitch, self.block.grid_shape)
-        low, high = (origin + (self.block.low + ends) * self.pitch for ends in (0, np.array(self.block.shape)))
+        origin = lattice_origin(self.aabb, self.pitch, block.grid_shape)
+        low, high = (origin + (block.low + ends) * self.pitch for ends in (0, np.array(block.shape)))
         slack = 0.5 * self.pitch  # the block's outermost cells are 0 unless the grid ends there
         near = np.flatnonzero(inside & ((places >= low - slack) & (places <= high + slack)).all(axis=1))
         local = ((places[near] - origin) / self.pitch - 0.5).astype(np.float32)
-        found = interpolate_grid(values, local - self.block.low.astype(np.float32)) / typical
+        found = interpolate_grid(values, local - block.low.astype(np.float32)) / typical
         result[index[near]] = found.astype(np.float32)
 
 
@@ -411,10 +416,10 @@ def _shell_pieces(
     return starts[which] + begin[:, None] * along, starts[which] + end[:, None] * along, which
 
 
-def _occupied(starts: FloatArray, ends: FloatArray, places: FloatArray, shape: tuple[int, ...]) -> Block:
-    """The block that holds all segments and, as far as they lie in the grid, the surroundings of all points (cells)."""
-    near = ((places > -SURFACE_REACH) & (places < np.array(shape) + SURFACE_REACH)).all(axis=1)
-    return Block.around(np.concatenate([starts, ends, places[near]]), shape, reach=SURFACE_REACH + 1)
+def _near(places: FloatArray, shape: tuple[int, ...], reach: int) -> BoolArray:
+    """Which places (in cells) lie in the grid or less than ``reach`` cells beside it."""
+    near: BoolArray = np.logical_and.reduce((places > -reach) & (places < np.array(shape) + reach), axis=1)
+    return near
 
 
 def _outnumbered(places: FloatArray, count: NDArray[np.int64], near: NDArray[np.float32], block: Block) -> BoolArray:
@@ -434,7 +439,7 @@ def _tents(
     Over the cells of the block, which holds all cells near a point.
     """
     shape = block.grid_shape
-    near = ((places > -reach) & (places < np.array(shape) + reach)).all(axis=1)
+    near = _near(places, shape, reach)
     local = (places[near] + reach + 0.5).T
     nodes, shares = lower_nodes(list(local), [length + 2 * reach + 2 for length in shape])
     padded = tuple(length + 2 * reach + 2 for length in block.shape)

@@ -87,6 +87,19 @@ def test_a_block_holds_all_that_the_grid_does():
     np.testing.assert_array_equal(block.whole(GridTraversal(block, starts, ends).count(all_lines)), expected)
 
 
+def test_a_block_moves_to_another():
+    grid = (6, 5, 4)
+    one, other = Block(np.array([1, 0, 2]), (3, 2, 2), grid), Block(np.array([2, 1, 0]), (4, 4, 3), grid)
+    values = np.arange(1, 13).reshape(3, 2, 2)
+    whole = one.whole(values)
+    assert whole.shape == grid
+    assert whole.sum() == values.sum()
+    assert whole[3, 1, 2] == values[2, 1, 0]
+    np.testing.assert_array_equal(one.moved(values, other), whole[2:6, 1:5, 0:3])
+    apart = Block(np.array([5, 4, 0]), (1, 1, 1), grid)
+    assert one.moved(values, apart).tolist() == [[[0]]]
+
+
 def test_hit_line_by_line():
     starts, ends = segments(60, seed=3)
     marked = np.random.default_rng(4).random(SHAPE) < 0.05
