@@ -28,6 +28,7 @@ WITHOUT_DATA = (
     "denoise.run",
     "regularizer.cost",
     "regularizer.rooms",
+    "regularizer.sight_lines",
     "regularizer.stability",
     "release.ship",
     "release.train_diffusion",

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+import dataclasses
+import functools
+import math
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -13,19 +14,21 @@ from numpy.typing import ArrayLike, NDArray
 from .aabb import as_aabb
 from .cameras import Cameras
 from .errors import InvalidArgument
-from .interpolate import interpolate_grid, trilinear_corners
+from .grid_traversal import Block, GridTraversal, clip_segments, segment_shares
+from .interpolate import corner_weights, interpolate_grid, lower_nodes
 from .lattice import lattice_origin
 from .sparse_points import SparsePoints
 
 FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 
 MARGIN_CELLS = 2.0  # a surface is spread over some of the field's own cells
 MARGIN_SIGMAS = 2.0  # of the point's uncertainty along the ray
 REACH = 2  # cells, of a point's support
 SURFACE_REACH = 3  # cells around a point that count as its surface where lines and points contradict each other
-LINES_AT_ONCE = 4096
-THREADS = 2
 MOST_CELLS = 1 << 28
+MOST_REACH = float(1 << 20)  # times the box; farther away a contracted field has less than a cell
+SHELL_CELLS = 2  # cells beyond the box are so many times as coarse, for their distance, as those in it
 
 
 @dataclass(frozen=True)
@@ -34,13 +37,21 @@ class SightLines:
 
     Attributes:
         starts, ends: ``(L, 3)`` of the segments, scene units: from the camera to the point less its margin, as far as
-            they lie in the box.
+            they lie in the box (of a shell: in the box and beyond the next smaller one).
         targets: ``(L, 3)`` the points that were observed, scene units; some may lie outside the box.
         crossing_count: ``(X, Y, Z)`` int32, how many segments pass through each cell.
         support_sum: ``(X, Y, Z)`` float32 at the cells' centres, how many points lie near, each with a tent-shaped
             weight that is 1 at the point and 0 from ``REACH`` cells on, along each axis.
         aabb: ``(2, 3)`` box of the grid, scene units.
         pitch: side of its cells, scene units.
+        crossed, crossed_block: ``crossing_count`` of the part of the grid that holds all lines; memory and time go with
+            what it holds, not with the box.
+        supported, supported_block: the same of ``support_sum`` and the points.
+        shells: the same for boxes that are twice as wide each, without what the next smaller one holds; empty unless
+            ``reach`` > 1.
+        far_starts, far_targets: ``(F, 3)`` cameras of, and points at the end of, lines that end in the shells.
+        report: counts of ``observations`` and, of these, ``too_near`` (nothing is left before the margin, or the rays
+            do not determine the point), ``outside`` (the segment does not meet the box) and ``outvoted``.
 
     Example:
         >>> from unghost.core.cameras import look_at
@@ -56,10 +67,16 @@ class SightLines:
     starts: FloatArray
     ends: FloatArray
     targets: FloatArray
-    crossing_count: NDArray[np.int32]
-    support_sum: NDArray[np.float32]
+    crossed: NDArray[np.int32]
+    crossed_block: Block
+    supported: NDArray[np.float32]
+    supported_block: Block
     aabb: FloatArray
     pitch: float
+    shells: tuple[SightLines, ...] = ()
+    far_starts: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    far_targets: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    report: dict[str, int] = field(default_factory=dict)
 
     @classmethod
     def build(
@@ -73,6 +90,7 @@ class SightLines:
         margin_cells: float = MARGIN_CELLS,
         margin_sigmas: float = MARGIN_SIGMAS,
         robust: bool = True,
+        reach: float = 1.0,
     ) -> SightLines:
         """Trace every observation through the grid.
 
@@ -88,63 +106,127 @@ class SightLines:
             robust: drop wrong points and lines by majority. A point in a cell that more lines cross than observations
                 end near is dropped with its lines; then so is a line through a cell near which more observations end
                 than lines cross. Without it, one wrong point in twelve lets lines pass through most surfaces.
+            reach: how many times the box lines, look-ups and samples go out to, in [1, 2^20]. What lies beyond the box
+                is kept in shells, each twice as wide as the one before with cells twice as wide, as those of a
+                contracted field (mip-NeRF 360) grow; margins grow likewise. What lies in the box stays as it is; what
+                is outvoted there is left out of the shells, too.
 
         Raises:
-            InvalidArgument: a pitch or margin out of range, too many cells.
+            InvalidArgument: a pitch, margin or reach out of range, too many cells.
         """
         box = as_aabb(aabb, caller="SightLines")
         if not 0 < pitch < np.inf:
             raise InvalidArgument(f"SightLines: pitch must be finite and > 0, got {pitch}")
         if not (margin_cells >= 0 and margin_sigmas >= 0):
             raise InvalidArgument(f"SightLines: margins must be >= 0, got {margin_cells} and {margin_sigmas}")
-        sides = np.ceil((box[1] - box[0]) / pitch - 1e-6)
-        if sides.prod() > MOST_CELLS:
-            raise InvalidArgument(f"SightLines: pitch {pitch} makes {sides.prod():.3g} cells, at most {MOST_CELLS}")
-        shape = tuple(int(side) for side in np.maximum(sides, 1))
+        if not 1 <= reach <= MOST_REACH:
+            raise InvalidArgument(f"SightLines: reach must be in [1, {MOST_REACH:.0f}], got {reach}")
+        cell = pitch if field_pitch is None else field_pitch
+        votes = _Votes(np.ones(len(points), dtype=bool), np.ones(len(points.point), dtype=bool), robust)
+        margin = np.full(len(points), margin_cells * cell)
+        segments = _segments(points, cameras, margin, margin_sigmas)
+        result = cls._traced(points, segments, votes, box=box, pitch=pitch, inner=None)
+        if reach == 1:
+            return result
+        margin = margin * contracted_growth(points.xyz, box, margin_cells * cell)
+        segments, shells, inner = _segments(points, cameras, margin, margin_sigmas), list[SightLines](), box
+        for level in range(1, math.ceil(math.log2(reach)) + 1):
+            outer = _grown(box, min(2.0**level, reach))
+            coarse = SHELL_CELLS * pitch * 2.0**level
+            shells.append(cls._traced(points, segments, votes, box=outer, pitch=coarse, inner=inner))
+            inner = outer
+        ends = segments[2][votes.kept[segments[2]]]
+        targets = points.xyz[points.point[ends]]
+        far = votes.right[points.point[ends]] & _within(targets, inner) & ~_within(targets, box)
+        origins = cameras.origins[points.camera[ends]]
+        return dataclasses.replace(result, shells=tuple(shells), far_starts=origins[far], far_targets=targets[far])
+
+    @classmethod
+    def _traced(
+        cls,
+        points: SparsePoints,
+        segments: tuple[FloatArray, FloatArray, NDArray[np.int64]],
+        votes: _Votes,
+        *,
+        box: FloatArray,
+        pitch: float,
+        inner: FloatArray | None,
+    ) -> SightLines:
+        """One box, without what lies in ``inner``; the votes of its cells are added to ``votes``."""
+        shape = _grid_shape(box, pitch)
         origin = lattice_origin(box, pitch, shape)
-        margin = margin_cells * (pitch if field_pitch is None else field_pitch)
-        starts, ends, owner = _segments(points, cameras, margin, margin_sigmas)
-        starts, ends, meets = _clipped((starts - origin) / pitch, (ends - origin) / pitch, shape)
-        owner, grid = owner[meets], _Grid(shape, starts, ends)
-        places, right, kept = (
-            (points.xyz - origin) / pitch,
-            np.ones(len(points), dtype=bool),
-            np.ones(len(starts), bool),
-        )
-        count = grid.count(kept)
-        if robust:
-            views = points.views().astype(float)
-            right = ~_outnumbered(places, count, _tents(places, shape, weights=views, reach=SURFACE_REACH))
+        alive = votes.kept[segments[2]]
+        starts, ends, observation = segments[0][alive], segments[1][alive], segments[2][alive]
+        starts, ends = (starts - origin) / pitch, (ends - origin) / pitch
+        if inner is None:
+            starts, ends, meets = clip_segments(starts, ends, shape)
+            which = np.flatnonzero(meets)
+        else:
+            starts, ends, which = _shell_pieces(starts, ends, (box - origin) / pitch, (inner - origin) / pitch)
+        report = {
+            "observations": len(points.point),
+            "too_near": len(points.point) - len(segments[2]),
+            "outside": len(segments[2]) - _number_of(observation[which], len(points.point)),
+        }
+        observation = observation[which]
+        owner, places = points.point[observation], (points.xyz - origin) / pitch
+        here = np.ones(len(points), dtype=bool) if inner is None else ~_within(points.xyz, inner)
+        block = Block.around(np.concatenate([starts, ends]), shape, reach=1)
+        around = Block.around(places[_near(places, shape, SURFACE_REACH)], shape, reach=SURFACE_REACH + 1)
+        grid, kept = GridTraversal(block, starts, ends), np.ones(len(starts), dtype=bool)
+        count, right = grid.count(kept), votes.right
+        if votes.robust:
+            views = points.views().astype(float) * right
+            near = _tents(places, around, weights=views, reach=SURFACE_REACH)
+            right &= ~(here & _outnumbered(places, block.moved(count, around), near, around))
             count -= grid.count(~right[owner])
-            surface = _tents(places[right], shape, weights=views[right], reach=SURFACE_REACH)
-            kept = right[owner] & ~grid.hit(np.greater(surface, np.maximum(count, 1)), short_of=SURFACE_REACH)
+            surface = _tents(places[right], around, weights=views[right], reach=SURFACE_REACH)
+            surface = np.greater(surface, np.maximum(block.moved(count, around), 1))
+            kept = right[owner] & ~grid.hit(around.moved(surface, block), short_of=SURFACE_REACH)
+            votes.kept[observation[~kept]] = False
+            kept = votes.kept[observation]
             count -= grid.count(right[owner] & ~kept)
-        support = _tents(places[right], shape)
+        report["outvoted"] = _number_of(observation[~kept], len(points.point))
+        support = _tents(places[right & here], around)
         starts, ends = (origin + each[kept] * pitch for each in (starts, ends))
         targets = points.xyz[owner[kept]]
-        return cls(starts, ends, targets, count.astype(np.int32), support, box, float(pitch))
+        crossed = count.astype(np.int32)
+        return cls(starts, ends, targets, crossed, block, support, around, box, float(pitch), report=report)
 
     def __len__(self) -> int:
-        return len(self.starts)
+        """Number of segments, those of the shells too."""
+        return len(self.starts) + sum(len(shell.starts) for shell in self.shells)
+
+    @functools.cached_property
+    def crossing_count(self) -> NDArray[np.int32]:
+        """``(X, Y, Z)`` int32, how many segments pass through each cell."""
+        return self.crossed_block.whole(self.crossed)
+
+    @functools.cached_property
+    def support_sum(self) -> NDArray[np.float32]:
+        """``(X, Y, Z)`` float32 at the cells' centres, how many points lie near."""
+        return self.supported_block.whole(self.supported)
 
     def crossings(self, positions: NDArray[Any]) -> NDArray[np.float32]:
         """Sight lines through the neighbourhood of ``positions (..., 3)``, relative to a typical crossed cell.
 
         Returns:
             ``(...)`` float32 >= 0: the interpolated count, divided by the mean count over the cells that any line
-            crosses, so that it hardly depends on how many photos and points there are. 0 outside the box.
+            crosses, so that it hardly depends on how many photos and points there are. 0 outside the box, or beyond
+            ``reach`` times it; between the two, relative to a typical cell of the same shell.
         """
-        return self._look_up(self.crossing_count, positions)
+        return self._look_up("_crossings", positions)
 
     def support(self, positions: NDArray[Any]) -> NDArray[np.float32]:
         """Sparse points near ``positions (..., 3)``, relative to a typical cell that has some; as :meth:`crossings`."""
-        return self._look_up(self.support_sum, positions)
+        return self._look_up("_support", positions)
 
     def sample(self, rng: np.random.Generator, count: int, *, samples: int = 12) -> tuple[FloatArray, FloatArray]:
         """Draw points on random sight lines, stratified along each.
 
         Args:
-            rng: draws lines with replacement, and a place in each of ``samples`` equal parts of each line.
+            rng: draws lines with replacement, and a place in each of ``samples`` equal parts of each line. Each shell's
+                part of a line is a line of its own, so that places are not all drawn far away.
             count: number of lines.
             samples: points a line.
 
@@ -156,178 +238,222 @@ class SightLines:
         """
         if not len(self):
             raise InvalidArgument("SightLines.sample: there is no sight line: points without observations, or too near")
+        starts, along, lengths = self._segments
         which = rng.integers(len(self), size=count)
-        along = self.ends[which] - self.starts[which]
         share = (np.arange(samples) + rng.random((count, samples))) / samples
-        return self.starts[which][:, None] + share[..., None] * along[:, None], np.linalg.norm(along, axis=1)
+        return starts[which][:, None] + share[..., None] * along[which][:, None], lengths[which]
 
     def sample_ends(
         self, rng: np.random.Generator, count: int, *, reach: float, samples: int = 8
-    ) -> tuple[FloatArray, float]:
+    ) -> tuple[FloatArray, float | FloatArray]:
         """Draw points about the observed points of random sight lines, along the lines, stratified.
 
         Args:
-            rng: draws lines with replacement among those whose point lies in the box.
-            count: number of lines; fewer come back if no point lies in the box.
-            reach: how far before and behind the point, scene units.
+            rng: draws lines with replacement among those whose point lies in the box or in a shell.
+            count: number of lines; none come back if no point lies there.
+            reach: how far before and behind the point, scene units. Beyond the box it grows as the cells of a
+                contracted field do.
             samples: points a line.
 
         Returns:
-            positions ``(count, samples, 3)`` and the length that they cover, ``2 * reach``.
+            positions ``(count, samples, 3)`` and the length that they cover: ``2 * reach``, with shells ``(count,)``.
         """
-        inside = np.flatnonzero(((self.targets >= self.aabb[0]) & (self.targets <= self.aabb[1])).all(axis=1))
-        if not len(inside):
+        targets, directions = self._ends
+        if not len(targets):
             return np.zeros((0, samples, 3)), 2 * reach
-        which = inside[rng.integers(len(inside), size=count)]
-        along = self.targets[which] - self.starts[which]
-        along /= np.linalg.norm(along, axis=1, keepdims=True)
+        which = rng.integers(len(targets), size=count)
         offset = reach * (2 * (np.arange(samples) + rng.random((count, samples))) / samples - 1)
-        return self.targets[which][:, None] + offset[..., None] * along[:, None], 2 * reach
+        covered: float | FloatArray = 2 * reach
+        if self.shells:
+            growth = contracted_growth(targets[which], self.aabb, reach)
+            offset, covered = offset * growth[:, None], 2 * reach * growth
+        return targets[which][:, None] + offset[..., None] * directions[which][:, None], covered
 
-    def _look_up(self, values: NDArray[Any], positions: NDArray[Any]) -> NDArray[np.float32]:
+    @functools.cached_property
+    def _segments(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Starts, offsets ``(L, 3)`` and lengths ``(L,)`` of all segments."""
+        levels = (self, *self.shells)
+        starts = np.concatenate([level.starts for level in levels])
+        along = np.concatenate([level.ends for level in levels]) - starts
+        return starts, along, np.linalg.norm(along, axis=1)
+
+    @functools.cached_property
+    def _ends(self) -> tuple[FloatArray, FloatArray]:
+        """Points that lines lead to, in the box and then beyond it, and the lines' directions ``(N, 3)``."""
+        here = _within(self.targets, self.aabb)
+        targets = np.concatenate([self.targets[here], self.far_targets])
+        along = targets - np.concatenate([self.starts[here], self.far_starts])
+        return targets, along / np.linalg.norm(along, axis=1, keepdims=True)
+
+    @functools.cached_property
+    def _crossings(self) -> tuple[Block, NDArray[np.float32], Any]:
+        """Values over a block, and what to divide by."""
+        present = self.crossed[self.crossed > 0]
+        return self.crossed_block, self.crossed.astype(np.float32), present.mean() if len(present) else None
+
+    @functools.cached_property
+    def _support(self) -> tuple[Block, NDArray[np.float32], Any]:
+        """As :meth:`_crossings`."""
+        present = self.supported[self.supported > 0]
+        return self.supported_block, self.supported, present.mean() if len(present) else None
+
+    def _look_up(self, name: str, positions: NDArray[Any]) -> NDArray[np.float32]:
         places = np.asarray(positions, dtype=np.float64)
-        present = values[values > 0]
-        if not len(present):
-            return np.zeros(places.shape[:-1], dtype=np.float32)
-        origin = lattice_origin(self.aabb, self.pitch, values.shape)
-        inside = ((places >= self.aabb[0]) & (places <= self.aabb[1])).all(axis=-1)
-        local = np.where(inside[..., None], (places - origin) / self.pitch - 0.5, 0.0)
-        found = interpolate_grid(values.astype(np.float32), local.astype(np.float32)) / present.mean()
-        return np.where(inside, found, 0.0).astype(np.float32)
+        flat = places.reshape(-1, 3)
+        result, rest, inner = np.zeros(len(flat), dtype=np.float32), np.arange(len(flat)), None
+        for level in (self, *self.shells):
+            places_here = flat if inner is None else flat[rest]
+            inside = _within(places_here, level.aabb)
+            level._interpolate(name, places_here, inside, rest, result)
+            rest, inner = rest[~inside], level.aabb
+        return result.reshape(places.shape[:-1])
+
+    def _interpolate(
+        self, name: str, places: FloatArray, inside: BoolArray, index: NDArray[np.int64], result: NDArray[np.float32]
+    ) -> None:
+        """Write the values at ``places[inside]`` to ``result[index[inside]]``; what no block holds stays 0."""
+        block, values, typical = getattr(self, name)
+        if typical is None:
+            return
+        origin = lattice_origin(self.aabb, self.pitch, block.grid_shape)
+        low, high = (origin + (block.low + ends) * self.pitch for ends in (0, np.array(block.shape)))
+        slack = 0.5 * self.pitch  # the block's outermost cells are 0 unless the grid ends there
+        near = np.flatnonzero(inside & ((places >= low - slack) & (places <= high + slack)).all(axis=1))
+        local = ((places[near] - origin) / self.pitch - 0.5).astype(np.float32)
+        found = interpolate_grid(values, local - block.low.astype(np.float32)) / typical
+        result[index[near]] = found.astype(np.float32)
+
+
+@dataclass(frozen=True)
+class _Votes:
+    """Which points ``(P,)`` and observations ``(M,)`` are not outvoted so far, and whether they are voted on."""
+
+    right: BoolArray
+    kept: BoolArray
+    robust: bool
+
+
+def contracted_growth(positions: FloatArray, aabb: FloatArray, length: float) -> FloatArray:
+    """How much farther a step of ``length`` in contracted coordinates goes at ``positions (..., 3)`` than in the box.
+
+    The coordinates are those of mip-NeRF 360 with the maximum norm (eq. 10), in which the box is ``[-1, 1]^3``: a step
+    inwards from the norm ``n`` > 1 ends where ``2 - 1 / n`` is smaller by the step. In the box, 1.
+
+    Example:
+        >>> box = np.array([[-1.0] * 3, [1.0] * 3])
+        >>> places = np.array([[0.9, 0.0, 0.0], [4.0, 0.0, 0.0], [1e6, 0.0, 0.0]])
+        >>> contracted_growth(places, box, 0.25).round().tolist()
+        [1.0, 8.0, 3999984.0]
+    """
+    half = (aabb[1] - aabb[0]) / 2
+    norm = np.maximum(np.abs((positions - (aabb[0] + half)) / half).max(axis=-1), 1.0)
+    step = length / float(half.max())
+    inwards = 2.0 - 1.0 / norm - step
+    reached = np.where(inwards > 1.0, 1.0 / (2.0 - np.maximum(inwards, 1.0)), inwards)
+    growth: FloatArray = np.where(norm > 1.0, (norm - reached) / step, 1.0) if step > 0 else np.ones(norm.shape)
+    return growth
+
+
+def _number_of(index: NDArray[np.int64], count: int) -> int:
+    """How many different ones of ``count`` there are in ``index``."""
+    present = np.zeros(count, dtype=bool)
+    present[index] = True
+    return int(present.sum())
+
+
+def _grown(box: FloatArray, factor: float) -> FloatArray:
+    """The box ``factor`` times as wide about its centre."""
+    middle, half = (box[0] + box[1]) / 2, (box[1] - box[0]) / 2
+    return np.stack([middle - half * factor, middle + half * factor])
+
+
+def _within(places: FloatArray, box: FloatArray) -> BoolArray:
+    """Which ``places (N, 3)`` lie in the closed box."""
+    inside: BoolArray = np.logical_and.reduce((places >= box[0]) & (places <= box[1]), axis=1)
+    return inside
+
+
+def _grid_shape(box: FloatArray, pitch: float) -> tuple[int, ...]:
+    """Cells along each axis of a grid that covers the box; refuses too many."""
+    sides = np.ceil((box[1] - box[0]) / pitch - 1e-6)
+    if sides.prod() > MOST_CELLS:
+        raise InvalidArgument(f"SightLines: pitch {pitch} makes {sides.prod():.3g} cells, at most {MOST_CELLS}")
+    return tuple(int(side) for side in np.maximum(sides, 1))
 
 
 def _segments(
-    points: SparsePoints, cameras: Cameras, margin: float, sigmas: float
+    points: SparsePoints, cameras: Cameras, margin: FloatArray, sigmas: float
 ) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
-    """Starts and ends ``(L, 3)`` of the segments that are longer than their margins, and the points they end at."""
+    """Starts and ends ``(L, 3)`` of the segments that are longer than their margins, and their observations."""
     origins, targets = cameras.origins[points.camera], points.xyz[points.point]
     offset = targets - origins
     distance = np.linalg.norm(offset, axis=1)
     uncertainty = np.nan_to_num(points.uncertainty, nan=0.0, posinf=np.inf)[points.point]
     with np.errstate(invalid="ignore"):
-        keep = distance - margin - (sigmas * uncertainty if sigmas else 0.0)
+        keep = distance - margin[points.point] - (sigmas * uncertainty if sigmas else 0.0)
         share = np.divide(keep, distance, out=np.zeros_like(distance), where=distance > 0)
-    long: NDArray[np.bool_] = np.isfinite(share) & (share > 0)
-    return origins[long], origins[long] + share[long, None] * offset[long], points.point[long]
+    long: BoolArray = np.isfinite(share) & (share > 0)
+    return origins[long], origins[long] + share[long, None] * offset[long], np.flatnonzero(long)
 
 
-def _outnumbered(places: FloatArray, count: NDArray[np.int64], near: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _shell_pieces(
+    starts: FloatArray, ends: FloatArray, outer: FloatArray, inner: FloatArray
+) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
+    """The parts of segments ``(L, 3)`` in ``outer`` and not in ``inner``, at most two each, and whose they are."""
+
+    def cut_by(box: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        side = box[1] - box[0]
+        return segment_shares((starts - box[0]) / side, (ends - box[0]) / side, (1, 1, 1))
+
+    first, last, meets = cut_by(outer)
+    enter, leave, cut = cut_by(inner)
+    enter, leave = (np.clip(np.where(cut, share, last), first, last) for share in (enter, leave))
+    before, behind = meets & (enter > first), meets & (last > leave)
+    which = np.concatenate([np.flatnonzero(before), np.flatnonzero(behind)])
+    begin = np.concatenate([first[before], leave[behind]])
+    end = np.concatenate([enter[before], last[behind]])
+    along = ends[which] - starts[which]
+    return starts[which] + begin[:, None] * along, starts[which] + end[:, None] * along, which
+
+
+def _near(places: FloatArray, shape: tuple[int, ...], reach: int) -> BoolArray:
+    """Which places (in cells) lie in the grid or less than ``reach`` cells beside it."""
+    near: BoolArray = np.logical_and.reduce((places > -reach) & (places < np.array(shape) + reach), axis=1)
+    return near
+
+
+def _outnumbered(places: FloatArray, count: NDArray[np.int64], near: NDArray[np.float32], block: Block) -> BoolArray:
     """Which points (in cells) lie in a cell that more lines cross than observations end near."""
-    cells = np.floor(places).astype(np.int64)
-    inside: NDArray[np.bool_] = np.logical_and.reduce((cells >= 0) & (cells < np.array(count.shape)), axis=1)
-    index = tuple(np.where(inside[:, None], cells, 0).T)
-    outnumbered: NDArray[np.bool_] = inside & (count[index] > near[index])
+    cells = np.floor(places)
+    inside: BoolArray = np.logical_and.reduce((cells >= 0) & (cells < np.array(block.grid_shape)), axis=1)
+    index = tuple(np.where(inside[:, None], cells - block.low, 0).astype(np.int64).T)
+    outnumbered: BoolArray = inside & (count[index] > near[index])
     return outnumbered
 
 
-def _clipped(
-    starts: FloatArray, ends: FloatArray, shape: tuple[int, ...]
-) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-    """The parts of segments within the grid ``[0, shape]``, in cells, and which segments have one."""
-    along = ends - starts
-    with np.errstate(divide="ignore", invalid="ignore"):
-        low, high = -starts / along, (np.array(shape, dtype=float) - starts) / along
-    parallel, within = along == 0, (starts >= 0) & (starts <= np.array(shape))
-    enter = np.where(parallel, np.where(within, -np.inf, np.inf), np.minimum(low, high)).max(axis=1)
-    leave = np.where(parallel, np.where(within, np.inf, -np.inf), np.maximum(low, high)).min(axis=1)
-    enter, leave = np.maximum(enter, 0.0), np.minimum(leave, 1.0)
-    meets: NDArray[np.bool_] = enter < leave
-    first, last = (starts[meets] + share[meets, None] * along[meets] for share in (enter, leave))
-    return first, last, meets
-
-
-class _Grid:
-    """Segments ``(L, 3)`` within a grid of cells, in cells."""
-
-    def __init__(self, shape: tuple[int, ...], starts: FloatArray, ends: FloatArray) -> None:
-        self.shape, self.size = shape, int(np.prod(shape))
-        self.starts, self.ends = starts, ends
-
-    def count(self, chosen: NDArray[np.bool_]) -> NDArray[np.int64]:
-        """How many of the chosen segments ``(L,)`` pass through each cell."""
-        lines = np.flatnonzero(chosen)
-
-        def counted(part: NDArray[np.int64]) -> NDArray[np.int64]:
-            total = np.zeros(self.size, dtype=np.int64)
-            for start in range(0, len(part), LINES_AT_ONCE):
-                for _, cells in self._crossed(part[start : start + LINES_AT_ONCE]):
-                    total += np.bincount(cells, minlength=self.size)
-            return total
-
-        return np.sum(_in_threads(counted, lines), axis=0).reshape(self.shape)
-
-    def hit(self, marked: NDArray[np.bool_], *, short_of: float) -> NDArray[np.bool_]:
-        """Which segments ``(L,)`` pass through a marked cell farther than ``short_of`` cells from their end."""
-        along = self.ends - self.starts
-        length = np.linalg.norm(along, axis=1)
-        share = np.maximum(1.0 - short_of / np.maximum(length, 1e-300), 0.0)
-        long = share > 0
-        result = np.zeros(len(along), dtype=bool)
-        result[long] = _Grid(self.shape, self.starts[long], (self.starts + share[:, None] * along)[long])._hit(marked)
-        return result
-
-    def _hit(self, marked: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        flat, result = marked.ravel(), np.zeros(len(self.starts), dtype=bool)
-
-        def mark(part: NDArray[np.int64]) -> None:
-            for start in range(0, len(part), LINES_AT_ONCE):
-                lines = part[start : start + LINES_AT_ONCE]
-                for line, cells in self._crossed(lines):
-                    result[lines[line[flat[cells]]]] = True
-
-        _in_threads(mark, np.arange(len(self.starts)))
-        return result
-
-    def _crossed(self, lines: NDArray[np.int64]) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-        """Positions in ``lines`` and flat indices of the cells that those segments pass through, each cell once.
-
-        A segment enters a cell through one face. So the cells are the one it starts in and, for every grid plane that
-        it crosses, the one behind that plane (Amanatides and Woo 1987, without the order along the segment).
-        """
-        start, end = self.starts[lines], self.ends[lines]
-        along, top = end - start, np.array(self.shape) - 1
-        stride = np.array([self.shape[1] * self.shape[2], self.shape[2], 1])
-        first = np.clip(np.floor(start).astype(np.int64), 0, top)
-        last = np.clip(np.floor(end).astype(np.int64), 0, top)
-        found = [(np.arange(len(lines)), first @ stride)]
-        for axis in range(3):
-            steps = np.abs(last[:, axis] - first[:, axis])
-            line = np.repeat(np.arange(len(lines)), steps)
-            number = np.arange(len(line)) - np.repeat(np.cumsum(steps) - steps, steps)
-            up = last[:, axis] > first[:, axis]
-            entered = first[line, axis] + np.where(up, 1, -1)[line] * (number + 1)
-            share = (entered + np.where(up, 0, 1)[line] - start[line, axis]) / along[line, axis]
-            cells = entered * stride[axis]
-            for other in {0, 1, 2} - {axis}:
-                place = (start[line, other] + share * along[line, other]).astype(np.int64)  # >= 0: truncated is floored
-                cells += np.clip(place, 0, top[other]) * stride[other]
-            found.append((line, cells))
-        return found
-
-
-def _in_threads(call: Callable[[NDArray[np.int64]], Any], lines: NDArray[np.int64]) -> list[Any]:
-    """Call with interleaved parts of ``lines``, a thread each; numpy's loops run side by side."""
-    parts = [lines[index::THREADS] for index in range(THREADS)]
-    if len(lines) < 2 * LINES_AT_ONCE:
-        return [call(lines)]
-    with ThreadPoolExecutor(THREADS) as pool:
-        return list(pool.map(call, parts))
-
-
 def _tents(
-    places: FloatArray, shape: tuple[int, ...], *, weights: FloatArray | None = None, reach: int = REACH
+    places: FloatArray, block: Block, *, weights: FloatArray | None = None, reach: int = REACH
 ) -> NDArray[np.float32]:
-    """Sum of weighted tents ``prod max(0, 1 - |cell centre - point| / reach)`` over points; places in cells."""
-    near = ((places > -reach) & (places < np.array(shape) + reach)).all(axis=1)
-    padded = tuple(length + 2 * reach + 2 for length in shape)
-    index, shares = trilinear_corners(places[near] + reach + 0.5, padded)
-    shares = shares if weights is None else shares * weights[near, None]
-    flat = np.bincount(index.ravel(), weights=shares.ravel(), minlength=int(np.prod(padded)))
+    """Sum of weighted tents ``prod max(0, 1 - |cell centre - point| / reach)`` over points; places in cells.
+
+    Over the cells of the block, which holds all cells near a point.
+    """
+    shape = block.grid_shape
+    near = _near(places, shape, reach)
+    local = (places[near] + reach + 0.5).T
+    nodes, shares = lower_nodes(list(local), [length + 2 * reach + 2 for length in shape])
+    padded = tuple(length + 2 * reach + 2 for length in block.shape)
+    x, y, z = (node.astype(np.int64) - low for node, low in zip(nodes, block.low))
+    corners = [(i * padded[1] + j) * padded[2] + k for i in (0, 1) for j in (0, 1) for k in (0, 1)]
+    index = ((x * padded[1] + y) * padded[2] + z)[:, None] + np.array(corners)
+    amounts = np.stack(corner_weights(shares), axis=-1)
+    amounts = amounts if weights is None else amounts * weights[near, None]
+    flat = np.bincount(index.ravel(), weights=amounts.ravel(), minlength=int(np.prod(padded)))
     total: FloatArray = flat.astype(np.float64).reshape(padded)
     taps = 1.0 - np.abs(np.arange(1 - reach, reach)) / reach  # tents of one cell to tents of `reach` cells, exactly
     for axis in range(3):
         total = _convolved(total, taps, axis)
-    inner = tuple(slice(reach + 1, reach + 1 + length) for length in shape)
+    inner = tuple(slice(reach + 1, reach + 1 + length) for length in block.shape)
     return total[inner].astype(np.float32)
 
 

@@ -181,7 +181,7 @@ class DensityRegularizer:
         return losses
 
     def _sight_lines_of(self, points: SparsePoints | None) -> SightLines | None:
-        """Lines in the box that the visibility loss reaches; the loss may ask the field anywhere in it."""
+        """Lines in the box that the visibility loss reaches, and beyond; the loss may ask the field anywhere there."""
         s = self.settings
         if points is None:
             return None
@@ -195,7 +195,8 @@ class DensityRegularizer:
         warn_if_not_in_view(points, self.cameras, caller="DensityRegularizer")
         box, cell = grow_box(self.aabb, s.visibility_reach), self._nominal_pitch()
         pitch = max(cell, scene_extent(box) / MOST_LINE_CELLS)
-        lines = SightLines.build(points, self.cameras, aabb=box, pitch=pitch, field_pitch=cell)
+        reach = max(s.sight_line_reach / s.visibility_reach, 1.0)
+        lines = SightLines.build(points, self.cameras, aabb=box, pitch=pitch, field_pitch=cell, reach=reach)
         if not len(lines):
             warnings.warn(
                 f"DensityRegularizer: the sight-line loss is 0, as no line is left of {len(points)} points with "
@@ -393,7 +394,8 @@ class DensityRegularizer:
             places, covered = lines.sample_ends(self._rng(4), s.sight_lines, reach=reach)
             for field in fields if len(places) else ():
                 density = self._on_lines(field, places, device)
-                total = total + stable_mean(end_point_loss(density, covered)) * s.end_point_weight
+                span = covered if isinstance(covered, float) else torch.as_tensor(covered).to(density)
+                total = total + stable_mean(end_point_loss(density, span)) * s.end_point_weight
         return total
 
     def _on_lines(self, field: DensityFn, places: NDArray[np.float64], device: torch.device) -> Tensor:

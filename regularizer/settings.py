@@ -11,6 +11,7 @@ from typing import Any
 from ..core.errors import InvalidArgument
 from ..core.occupancy import OccupancyRule
 from ..core.schedule import check_timestep
+from ..core.sight_lines import MOST_REACH
 from .proposals import Strategy
 from .visibility import PointKind
 
@@ -46,6 +47,8 @@ class RegularizerSettings:
         sight_line_weight, end_point_weight: factors of the two terms of the sight-line loss, which needs ``points``:
             the mean opacity of random sight lines, and the mean transparency of four field cells about their points.
         sight_lines, sight_line_samples: lines a step for each term, and places on each.
+        sight_line_reach: how many times the aabb the lines may go out to, in [1, 2^20]; the box of ``visibility_reach``
+            is always covered. More is for contracted fields: lines to points beyond that box end earlier.
         light_steps: for a denoiser that asks how well the photos see a place through the field: steps after which
             the rays are followed anew.
         min_views: points seen by fewer cameras are penalised (1: the paper).
@@ -81,6 +84,7 @@ class RegularizerSettings:
     end_point_weight: float = 0.01
     sight_lines: int = 4096
     sight_line_samples: int = 12
+    sight_line_reach: float = 1.0
     light_steps: int = 50
     min_views: int = 1
     rule: OccupancyRule = dataclasses.field(default_factory=OccupancyRule)
@@ -99,6 +103,7 @@ class RegularizerSettings:
             "visibility_samples": (self.visibility_samples >= 0, ">= 0"),
             "sight_lines": (self.sight_lines >= 0, ">= 0"),
             "sight_line_samples": (self.sight_line_samples >= 1, ">= 1"),
+            "sight_line_reach": (1 <= self.sight_line_reach <= MOST_REACH, f"in [1, {MOST_REACH:.0f}]"),
             "sight_line_weight": (
                 math.isfinite(self.sight_line_weight) and self.sight_line_weight >= 0,
                 "finite and >= 0",

@@ -1,7 +1,7 @@
 """What the regularizer and ``clean`` do with hostile numbers, and how far they are from float64.
 
 Prints the table of ``docs/stability.md``; every row checks the behaviour that it states. Those about a single loss are
-in ``losses.py``.
+in ``losses.py``, those about sight lines in ``line_cases.py``.
 
     python -m benchmarks.regularizer.stability
     python -m benchmarks.regularizer.stability --short      float32 alone
@@ -29,6 +29,7 @@ from unghost.regularizer.visibility import ViewCounter
 
 from ..options import BenchmarkOptions, parse
 from ..progress import say
+from .line_cases import LINE_CASES
 from .losses import BRAIN, LOSS_CASES, SINGLE, TYPES, Case, largest, refuses, relative, smallest
 
 BOX = np.array([[-1.0] * 3, [1.0] * 3])
@@ -296,6 +297,7 @@ CASES = [
     Case("t = 999", FINITE, lambda t: timestep(999, t)),
     Case("a batch of 0: no cubes, no points", "exactly 0", lambda _: nothing(), SINGLE),
     *LOSS_CASES,
+    *LINE_CASES,
 ]
 
 HEAD = ("| input | behaviour | float32 | float16 | bfloat16 |", "|---|---|---|---|---|")

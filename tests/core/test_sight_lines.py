@@ -216,9 +216,206 @@ def test_what_cannot_be_a_line_is_none():
         ({"pitch": float("nan")}, "pitch must be finite and > 0"),
         ({"pitch": 1e-4}, "makes .* cells, at most"),
         ({"pitch": 0.1, "margin_cells": -1.0}, "margins must be >= 0"),
+        ({"pitch": 0.1, "reach": 0.5}, r"reach must be in \[1, 1048576\], got 0.5"),
+        ({"pitch": 0.1, "reach": float("nan")}, "reach must be in"),
+        ({"pitch": 0.1, "reach": 1e9}, "reach must be in"),
     ],
 )
 def test_refusals(options, message):
     cameras = rig(2)
     with pytest.raises(ValueError, match=message):
         SightLines.build(observed(np.zeros((1, 3)), cameras), cameras, aabb=BOX, **options)
+
+
+def spread(seed=6, near=40, far=40, outwards=9.0):
+    """Cameras round the box; points in it and, in all directions, beyond it."""
+    rng = np.random.default_rng(seed)
+    direction = rng.normal(size=(far, 3))
+    direction /= np.abs(direction).max(axis=1, keepdims=True)
+    return rig(8), np.concatenate([rng.uniform(-0.8, 0.8, (near, 3)), direction * rng.uniform(1.3, outwards, (far, 1))])
+
+
+def test_what_lies_in_the_box_does_not_depend_on_the_reach():
+    cameras, xyz = spread(outwards=40.0)
+    places = np.random.default_rng(0).uniform(*BOX, (2000, 3))
+    points = observed(xyz, cameras)
+    short, long = (
+        SightLines.build(points, cameras, aabb=BOX, pitch=0.1, field_pitch=0.005, margin_sigmas=0.0, reach=reach)
+        for reach in (1.0, 20.0)
+    )
+    for name in ("starts", "ends", "targets", "crossing_count", "support_sum"):
+        np.testing.assert_array_equal(getattr(long, name), getattr(short, name))
+    np.testing.assert_array_equal(long.crossings(places), short.crossings(places))
+    assert short.shells == ()
+    assert [len(shell) > 0 for shell in long.shells] == [True] * 5
+    assert len(long) == len(short) + sum(map(len, long.shells))
+    assert len(short) > 50
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("robust", [False, True])
+def test_counts_of_shells_are_those_of_the_slow_twin(robust):
+    cameras, xyz = spread()
+    points = observed(xyz, cameras)
+    lines = SightLines.build(points, cameras, aabb=BOX, pitch=0.15, reach=6.0, robust=robust)
+    inner = BOX
+    for shell in lines.shells:
+        np.testing.assert_array_equal(shell.crossing_count, counted_slowly(shell))
+        middle = (shell.starts + shell.ends) / 2
+        assert ((middle < inner[0]) | (middle > inner[1])).any(axis=1).all()
+        assert ((middle >= shell.aabb[0]) & (middle <= shell.aabb[1])).all()
+        inner = shell.aabb
+    np.testing.assert_allclose(inner - inner.mean(axis=0), 6 * (BOX - BOX.mean(axis=0)))
+
+
+def test_the_pieces_of_a_line_add_up():
+    """From (-7, .1, .2) through the box [-1, 1]^3 to a point at x = 30 that is as good as free of a margin."""
+    camera = Cameras.create(
+        look_at(np.array([[-7.0, 0.1, 0.2]]), np.array([[30.0, 0.1, 0.2]])), np.array([80.0, 80.0, 64.0, 48.0]), 128, 96
+    )
+    points = SparsePoints.create([[30.0, 0.1, 0.2]], point=[0], camera=[0])
+    box = [[-1.0] * 3, [1.0] * 3]
+    lines = SightLines.build(points, camera, aabb=box, pitch=0.25, margin_cells=0.0, robust=False, reach=10.0)
+    spans = [sorted(zip(each.starts[:, 0].round(9), each.ends[:, 0].round(9))) for each in (lines, *lines.shells)]
+    assert spans == [[(-1, 1)], [(-2, -1), (1, 2)], [(-4, -2), (2, 4)], [(-7, -4), (4, 8)], [(8, 10)]]
+    places = np.array([[x, 0.1, 0.2] for x in (-8.5, -6.5, -3, -1.5, 0, 1.5, 3, 7, 9.5, 10.5, 29)])
+    assert (lines.crossings(places) > 0).tolist() == [False] + [True] * 8 + [False] * 2
+    _, lengths = lines.sample(np.random.default_rng(0), 400)
+    assert set(lengths.round(9)) == {1.0, 2.0, 3.0, 4.0}
+    single = SightLines.build(points, camera, aabb=box, pitch=0.25, margin_cells=2.0, robust=False, reach=64.0)
+    ends = np.concatenate([each.ends[:, 0] for each in single.shells]).max()
+    assert ends == pytest.approx(1 / (1 / 30 + 0.5))  # eq. 10 of mip-NeRF 360: 2 - 1 / n less two cells of 1 / 4
+
+
+def test_points_beyond_the_box_support_and_are_sampled():
+    cameras, xyz = spread(near=0)
+    points = observed(xyz, cameras, error=np.full(len(xyz), 0.0))
+    lines = SightLines.build(points, cameras, aabb=BOX, pitch=0.1, field_pitch=0.02, robust=False, reach=16.0)
+    assert (lines.support(xyz) > 0).all()
+    assert (SightLines.build(points, cameras, aabb=BOX, pitch=0.1, robust=False).support(xyz) == 0).all()
+    assert (
+        lines.crossings(np.concatenate([level.starts + 0.5 * (level.ends - level.starts) for level in lines.shells]))
+        > 0
+    ).all()
+    places, lengths = lines.sample(np.random.default_rng(0), 500)
+    assert np.isfinite(places).all()
+    assert (places < BOX[0]).any()
+    assert (lengths > 0).all()
+    ends, covered = lines.sample_ends(np.random.default_rng(0), 300, reach=0.04)
+    assert covered.shape == (300,)
+    assert covered.min() > 0.08  # more than in the box
+    nearest = np.linalg.norm(ends[:, :, None] - xyz, axis=-1).min(axis=(1, 2))
+    assert (nearest < covered / 8).all()
+    assert (lines.crossings(np.full((1, 3), 1e3)) == 0).all()
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_far_points_are_finite_or_counted(scale):
+    """From a thousand to a million boxes away, in every unit."""
+    origins = rig(8).origins * scale
+    cameras = Cameras.create(look_at(origins, np.zeros((8, 3))), np.array([80.0, 80.0, 64.0, 48.0]), 128, 96)
+    direction = np.random.default_rng(0).normal(size=(40, 3))
+    xyz = scale * direction * np.logspace(3, 6, 40)[:, None]
+    points = observed(xyz, cameras)
+    lines = SightLines.build(points, cameras, aabb=BOX * scale, pitch=0.1 * scale, margin_sigmas=0.0, reach=2.0**20)
+    assert len(lines.shells) == 20
+    assert (
+        lines.report["observations"]
+        == 320
+        == len(lines.starts) + sum(lines.report[name] for name in ("too_near", "outside", "outvoted"))
+    )
+    places, lengths = lines.sample(np.random.default_rng(0), 1000)
+    ends, covered = lines.sample_ends(np.random.default_rng(0), 100, reach=0.2 * scale)
+    found = [lines.crossings(places), lines.support(xyz), lines.crossings(xyz), places, lengths, ends, covered]
+    assert all(np.isfinite(each).all() for each in found)
+    assert len(ends) == 100
+    uncertain = SightLines.build(points, cameras, aabb=BOX * scale, pitch=0.1 * scale, reach=2.0**20)
+    assert uncertain.report["too_near"] == 320  # half a pixel is more than all the distance
+
+
+@pytest.mark.parametrize("reach", [1.0, 8.0])
+def test_the_unit_does_not_matter_beyond_the_box(reach):
+    cameras, xyz = spread()
+    places = np.random.default_rng(4).uniform(-4, 4, size=(500, 3))
+    lines = SightLines.build(observed(xyz, cameras), cameras, aabb=BOX, pitch=0.1, reach=reach)
+    assert (lines.crossings(places[np.abs(places).max(axis=1) > 1.5]) > 0).any() == (reach > 1)
+    for scale in (2.0**-20, 2.0**20):  # exact, so that ties are not broken by rounding
+        poses = cameras.camera_to_world.copy()
+        poses[:, :, 3] *= scale
+        scaled = Cameras.create(poses, cameras.intrinsics, 128, 96)
+        points = observed(xyz * scale, scaled)
+        other = SightLines.build(points, scaled, aabb=BOX * scale, pitch=0.1 * scale, reach=reach)
+        np.testing.assert_allclose(other.crossings(places * scale), lines.crossings(places), rtol=1e-3, atol=1e-3)
+        np.testing.assert_allclose(other.support(places * scale), lines.support(places), rtol=1e-3, atol=1e-3)
+
+
+def test_an_empty_box_costs_nothing():
+    """Twice the box, eight times the cells: the same block is stored and looked up."""
+    cameras, xyz = rig(radius=0.5), np.random.default_rng(3).uniform(-0.5, 0.5, size=(30, 3))
+    box = np.array([[-1.0] * 3, [1.0] * 3])
+    places = np.random.default_rng(4).uniform(-1, 1, size=(500, 3))
+    small, large = (
+        SightLines.build(observed(xyz, cameras), cameras, aabb=box * side, pitch=0.1) for side in (1.0, 2.0)
+    )
+    assert small.crossed.shape == large.crossed.shape
+    assert small.supported.shape == large.supported.shape
+    np.testing.assert_array_equal(small.crossed, large.crossed)
+    np.testing.assert_allclose(small.supported, large.supported, atol=1e-6)
+    np.testing.assert_allclose(small.crossings(places), large.crossings(places), atol=1e-5)
+    np.testing.assert_allclose(small.support(places), large.support(places), atol=1e-5)
+    np.testing.assert_array_equal(large.crossing_count[10:30, 10:30, 10:30], small.crossing_count)
+    assert large.crossing_count.sum() == small.crossing_count.sum() > 0
+
+
+def test_duplicates_count_as_often_as_they_are_given():
+    cameras, xyz = rig(), np.random.default_rng(3).uniform(-0.5, 0.5, size=(30, 3))
+    once, twice = (
+        SightLines.build(observed(np.tile(xyz, (n, 1)), cameras), cameras, aabb=BOX, pitch=0.1, robust=False)
+        for n in (1, 2)
+    )
+    np.testing.assert_array_equal(twice.crossing_count, 2 * once.crossing_count)
+    np.testing.assert_allclose(twice.support_sum, 2 * once.support_sum, rtol=1e-6)
+    places = np.random.default_rng(4).uniform(*BOX, size=(500, 3))
+    np.testing.assert_allclose(twice.crossings(places), once.crossings(places), rtol=1e-5)  # relative: no matter
+
+
+@pytest.mark.parametrize("reach", [1.0, 16.0])
+def test_points_that_all_lie_outside(reach):
+    """Lines pass through the box, or not at all; nothing supports in it."""
+    cameras = rig(2)
+    through = SightLines.build(observed(-cameras.origins * 2, cameras), cameras, aabb=BOX, pitch=0.1, reach=reach)
+    assert len(through.starts) > 0
+    assert through.support_sum.max() == 0
+    away = SparsePoints.create(cameras.origins * 3, point=[0, 1], camera=[0, 1])
+    lines = SightLines.build(away, cameras, aabb=BOX, pitch=0.1, reach=reach)
+    assert len(lines.starts) == 0
+    assert lines.report["outside"] == 2
+    assert lines.crossing_count.max() == 0
+    assert (lines.crossings(np.zeros((5, 3))) == 0).all()
+    ends, _ = lines.sample_ends(np.random.default_rng(0), 4, reach=0.1)
+    assert len(ends) == (0 if reach == 1 else 4)
+
+
+@pytest.mark.parametrize("place", [[0.0, 0.0, 0.0], [-1.0, -1.2, -0.8], [1.1, 1.0, 0.9]])
+def test_a_single_point(place):
+    cameras = rig()
+    lines = SightLines.build(observed(np.array([place]), cameras), cameras, aabb=BOX, pitch=0.1, reach=2.0)
+    assert np.isfinite(lines.crossings(np.array([place]))).all()
+    assert lines.support(np.array([place]))[0] > 0
+    assert lines.report["outvoted"] == 0
+
+
+def test_a_point_at_a_camera_is_no_line_and_hides_none():
+    cameras = rig()
+    xyz = np.random.default_rng(3).uniform(-0.5, 0.5, size=(30, 3))
+    clean = SightLines.build(observed(xyz, cameras), cameras, aabb=BOX * 3, pitch=0.1, reach=3.0)
+    point, camera = (part.ravel() for part in np.meshgrid(np.arange(30), np.arange(6), indexing="ij"))
+    given = SparsePoints.create(
+        np.concatenate([xyz, cameras.origins[:1]]),
+        point=np.append(point, 30),
+        camera=np.append(camera, 0),
+        cameras=cameras,
+    )
+    lines = SightLines.build(given, cameras, aabb=BOX * 3, pitch=0.1, reach=3.0)
+    assert lines.report["too_near"] == clean.report["too_near"] + 1
+    np.testing.assert_array_equal(lines.crossing_count, clean.crossing_count)

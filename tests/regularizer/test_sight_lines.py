@@ -129,3 +129,43 @@ def test_what_does_not_fit_is_refused(denoiser):
     for name, value in (("sight_lines", -1), ("sight_line_samples", 0), ("sight_line_weight", -1.0)):
         with pytest.raises(ValueError, match=f"{name} must be"):
             RegularizerSettings(**{name: value})
+
+
+def test_ghosts_beyond_the_box_go_if_the_lines_reach_there(denoiser):
+    """A ball at z = 3 between cameras at z = -0.9 and a wall at z = 6: outside the box, on the way to the points."""
+    rng = np.random.default_rng(0)
+    origins = np.stack([*rng.uniform(-0.7, 0.7, (2, 8)), np.full(8, -0.9)], axis=1)
+    cameras = Cameras.create(
+        look_at(origins, np.tile([0.0, 0.0, 6.0], (8, 1))), np.array([3000.0, 3000.0, 400.0, 400.0]), 800, 800
+    )
+    xyz = np.stack([*rng.uniform(-0.5, 0.5, (2, 200)), np.full(200, 6.0)], axis=1)
+    point, camera = (each.ravel() for each in np.meshgrid(np.arange(200), np.arange(8), indexing="ij"))
+    points = SparsePoints.create(xyz, point=point, camera=camera, cameras=cameras)
+    asked = []
+
+    def density_fn(positions):
+        asked.append(positions.detach())
+        return level * ((positions - torch.tensor([0.0, 0.0, 3.0])).norm(dim=-1) < 0.7)
+
+    slopes = {}
+    for reach in (1.0, 8.0):
+        level = torch.tensor(0.3, requires_grad=True)
+        regularizer = DensityRegularizer(
+            denoiser,
+            aabb=AABB,
+            cameras=cameras,
+            points=points,
+            field_pitch=PITCH,
+            cubes=0,
+            visibility_weight=0.0,
+            sight_line_reach=reach,
+        )
+        asked.clear()
+        regularizer(density_fn)["sight_lines"].backward()
+        slopes[reach] = level.grad.item()
+        farthest = max(float(each.abs().max()) for each in asked)
+        assert farthest <= reach + 1e-5
+    assert slopes[1.0] == 0.0
+    assert slopes[8.0] > 1e-4
+    with pytest.raises(ValueError, match="sight_line_reach must be in"):
+        RegularizerSettings(sight_line_reach=0.9)
