@@ -60,6 +60,7 @@ class SparsePoints:
         camera: ArrayLike = (),
         cameras: Cameras | None = None,
         error: ArrayLike | None = None,
+        pixel_scale: ArrayLike = 1.0,
     ) -> SparsePoints:
         """Validate points and observations; repeated observations count once.
 
@@ -68,7 +69,9 @@ class SparsePoints:
             point: ``(M,)`` indices into ``xyz``; empty for points without tracks, which support but cross nothing.
             camera: ``(M,)`` indices into ``cameras``.
             cameras: the cameras, in the frame of ``xyz``: their indices are checked and the uncertainty follows.
-            error: ``(P,)`` reprojection error, pixels, >= 0; None if unknown.
+            error: ``(P,)`` reprojection error, pixels of the photos that were matched, >= 0; None if unknown.
+            pixel_scale: pixels of the matched photos for one pixel of ``cameras``, > 0, one number or ``(cameras,)``:
+                8 for cameras of photos at 1/8 of the size.
 
         Raises:
             InvalidArgument: a wrong shape, a coordinate that is not finite, an index out of range, an error < 0.
@@ -95,7 +98,14 @@ class SparsePoints:
         result = cls(places, pairs[:, 0].copy(), pairs[:, 1].copy(), off, np.full(len(places), np.nan))
         if cameras is None:
             return result
-        return cls(result.xyz, result.point, result.camera, result.error, _uncertainty(result, cameras))
+        scale = np.array(to_numpy(pixel_scale), dtype=np.float64)
+        if scale.shape not in ((), (len(cameras),)) or not ((scale > 0) & np.isfinite(scale)).all():
+            raise InvalidArgument(
+                f"SparsePoints: pixel_scale must be finite and > 0, one number or ({len(cameras)},), "
+                f"got {scale.min(initial=np.inf)} of shape {scale.shape}"
+            )
+        sigma = _uncertainty(result, cameras, np.broadcast_to(scale, (len(cameras),)))
+        return cls(result.xyz, result.point, result.camera, result.error, sigma)
 
     def __len__(self) -> int:
         return len(self.xyz)
@@ -151,9 +161,16 @@ class SparsePoints:
         part = SparsePoints(
             self.xyz, self.point[stays], renumber[self.camera[stays]], self.error, np.full(len(self), np.nan)
         )
-        part = part.select(part.views() >= least_views)
-        sigma = _uncertainty(part, cameras.select(chosen))
-        return SparsePoints(part.xyz, part.point, part.camera, part.error, sigma)
+        left = part.views() >= least_views
+        part = part.select(left)
+        ones = np.ones(len(cameras))
+        sigma, before = (
+            _uncertainty(each, whose, ones[: len(whose)])
+            for each, whose in ((part, cameras.select(chosen)), (self.select(left), cameras))
+        )
+        with np.errstate(invalid="ignore", over="ignore"):  # the ratio: cameras may be of smaller photos
+            told = self.uncertainty[left] * sigma / before
+        return SparsePoints(part.xyz, part.point, part.camera, part.error, np.where(np.isfinite(told), told, sigma))
 
     def angles(self, cameras: Cameras) -> FloatArray:
         """Triangulation angle: the largest angle between two rays to each point, ``(P,)``, degrees in [0, 180].
@@ -314,18 +331,20 @@ def _indices(name: str, values: ArrayLike, count: int | None) -> NDArray[np.int6
     return index.astype(np.int64)
 
 
-def _uncertainty(points: SparsePoints, cameras: Cameras) -> FloatArray:
+def _uncertainty(points: SparsePoints, cameras: Cameras, pixel_scale: FloatArray) -> FloatArray:
     """Largest standard deviation of each triangulated point ``(P,)``.
 
     Each ray gives the information ``(I - d d^T) / (r e / f)^2``: nothing along itself, and across it a keypoint error
-    of ``e`` pixels at the distance ``r``, focal length ``f`` pixels. The inverse of the sum is the covariance.
+    of ``e`` pixels at the distance ``r``, focal length ``f`` pixels, both of the matched photos. The inverse of the sum
+    is the covariance.
     """
     offset = points.xyz[points.point] - cameras.origins[points.camera]
     distance = np.linalg.norm(offset, axis=1)
     apart = distance > 0  # a point on a camera's centre has no ray
     who, distance = points.point[apart], distance[apart]
     ray = offset[apart] / distance[:, None]
-    focal = np.sqrt(cameras.intrinsics[points.camera[apart], 0] * cameras.intrinsics[points.camera[apart], 1])
+    focal = np.sqrt(cameras.intrinsics[:, 0] * cameras.intrinsics[:, 1]) * pixel_scale
+    focal = focal[points.camera[apart]]
     noise = np.maximum(np.nan_to_num(points.error, nan=PIXEL_NOISE), PIXEL_NOISE)[who]
     weight = (focal / (noise * distance)) ** 2
     information = np.zeros((len(points), 3, 3))

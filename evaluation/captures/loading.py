@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ...core.cameras import Cameras
 from ...core.errors import InvalidArgument, InvalidFile, MissingFile
@@ -95,7 +95,8 @@ class Capture:
         model = find_model(self.folder)
         if model is not None and has_points(model):
             moved = self.transform @ applied_motion(self.meta, self.folder)
-            points = read_points(model, self.names, self.cameras, transform=moved)
+            scale = self.pixel_scale(range(len(self)))
+            points = read_points(model, self.names, self.cameras, transform=moved, pixel_scale=scale)
         elif self.meta.get(PLY_KEY) is not None:
             points = read_point_cloud(self.folder, self.meta, self.cameras, transform=self.transform)
         else:
@@ -128,7 +129,8 @@ class Capture:
         if others:
             raise InvalidFile(f"Capture.points_of: {model} holds photos that are not in {split!r}, such as {others[0]}")
         cameras = self.cameras.select(chosen)
-        points = read_points(model, names, cameras, transform=self.transform)
+        scale = self.pixel_scale(chosen)
+        points = read_points(model, names, cameras, transform=self.transform, pixel_scale=scale)
         warn_if_not_in_view(points, cameras, caller="Capture.points_of")
         return points
 
@@ -136,6 +138,11 @@ class Capture:
         """Width and height of a photo as it is read: stored, or upright."""
         stored, shown, _ = photo_sizes(self._paths[index], caller="Capture.photo_size")
         return shown if index in self.upright else stored
+
+    def pixel_scale(self, indices: ArrayLike) -> NDArray[np.float64]:
+        """Pixels of the stored photos for one pixel of ``cameras``, by width: ``(n,)``, 8 at ``downscale=8``."""
+        chosen = np.asarray(indices, dtype=np.int64).tolist()
+        return np.array([self.photo_size(index)[0] / self.cameras.size(index)[0] for index in chosen])
 
     def split(self, name: str) -> NDArray[np.int64]:
         """Indices ``(n,)`` of the photos of one sweep, in its order; ``"all"`` is every photo.

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ...core.cameras import Cameras
 from ...core.errors import InvalidFile, MissingFile
@@ -143,7 +143,12 @@ def points_folder(folder: str | Path, split: str) -> Path:
 
 
 def read_points(
-    model: str | Path, names: Sequence[str], cameras: Cameras, *, transform: NDArray[np.float64] | None = None
+    model: str | Path,
+    names: Sequence[str],
+    cameras: Cameras,
+    *,
+    transform: NDArray[np.float64] | None = None,
+    pixel_scale: ArrayLike = 1.0,
 ) -> SparsePoints:
     """Read the sparse points of a COLMAP model and who observed them.
 
@@ -154,6 +159,7 @@ def read_points(
         cameras: in the frame of the result.
         transform: ``(4, 4)`` from the model's world to that of ``cameras``, a similarity without rotation
             (``Capture.transform``); None if they are one.
+        pixel_scale: pixels of the matched photos for one pixel of ``cameras``, one number or ``(cameras,)``.
 
     Returns:
         All points of the model, in its order; some may be left without observations.
@@ -177,7 +183,14 @@ def read_points(
     camera = table[tracks.image] if len(tracks.image) else np.zeros(0, dtype=np.int64)
     xyz = tracks.xyz if transform is None else tracks.xyz @ transform[:3, :3].T + transform[:3, 3]
     used = camera >= 0
-    return SparsePoints.create(xyz, point=tracks.point[used], camera=camera[used], cameras=cameras, error=tracks.error)
+    return SparsePoints.create(
+        xyz,
+        point=tracks.point[used],
+        camera=camera[used],
+        cameras=cameras,
+        error=tracks.error,
+        pixel_scale=pixel_scale,
+    )
 
 
 def has_points(model: Path) -> bool:

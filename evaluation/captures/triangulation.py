@@ -167,7 +167,8 @@ def _filter(
     (folder / "all").mkdir()
     model.write_binary(folder / "all")
     names, cameras = [capture.names[index] for index in chosen], capture.cameras.select(chosen)
-    points = read_points(folder / "all", names, cameras, transform=capture.transform)
+    scale = capture.pixel_scale(chosen)
+    points = read_points(folder / "all", names, cameras, transform=capture.transform, pixel_scale=scale)
     result = points.filtered(cameras, most_error=most_error, least_angle=least_angle)
     for number in read_tracks(folder / "all" / "points3D.bin").number[~result.kept].tolist():
         model.delete_point3D(number)

@@ -241,3 +241,24 @@ def test_a_point_on_a_cameras_centre_has_no_ray_of_it():
     assert points.uncertainty[0] == np.inf
     result = points.filtered(CAMERAS)
     assert (len(result.points), result.few_views) == (0, 1)
+
+
+def test_the_uncertainty_is_of_the_matched_photos_pixels():
+    """Cameras of photos at an eighth of the size, told so, give the uncertainty of the photos that were matched."""
+    poses = look_at(np.array([[2.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, -2.0, 0.5]]), np.zeros((3, 3)))
+    full = Cameras.create(poses, np.array([800.0, 800.0, 400.0, 400.0]), width=800, height=800)
+    small = full.resized(1 / 8)
+    tracks = {"point": [0, 0, 1, 1, 1], "camera": [0, 1, 0, 1, 2], "error": [0.3, 1.2]}
+    places = np.array([[0.0, 0.0, 0.0], [0.1, 0.2, -0.1]])
+    expected = SparsePoints.create(places, cameras=full, **tracks)
+    for scale in (8.0, np.full(3, 8.0)):
+        points = SparsePoints.create(places, cameras=small, pixel_scale=scale, **tracks)
+        np.testing.assert_allclose(points.uncertainty, expected.uncertainty, rtol=1e-12)
+    blunt = SparsePoints.create(places, cameras=small, **tracks)
+    np.testing.assert_allclose(blunt.uncertainty, 8 * expected.uncertainty, rtol=1e-12)
+    part = points.of(small, [0, 1])
+    np.testing.assert_allclose(part.uncertainty, expected.of(full, [0, 1]).uncertainty, rtol=1e-12)
+    np.testing.assert_array_equal(part.camera, [0, 1, 0, 1])
+    for bad in (0.0, -1.0, np.nan, np.ones(2)):
+        with pytest.raises(ValueError, match="SparsePoints: pixel_scale must be finite and > 0"):
+            SparsePoints.create(places, cameras=small, pixel_scale=bad, **tracks)

@@ -102,6 +102,7 @@ def test_the_verb_stores_them_and_the_capture_finds_them(room, found, capsys):
     again = load_capture(room, downscale=2).points_of("train")
     np.testing.assert_allclose(again.xyz, points.xyz, atol=1e-9)
     np.testing.assert_array_equal(again.camera, points.camera)
+    np.testing.assert_allclose(again.uncertainty, points.uncertainty, rtol=1e-6)  # whatever size is loaded
     assert cli.main(["points", str(room)]) == 2
     assert "is there already: remove it" in capsys.readouterr().err
     stored = points_folder(room, "train")
