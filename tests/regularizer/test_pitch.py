@@ -47,6 +47,7 @@ def test_of_several_fields_the_first_one_counts(kit, aabb):
     assert regularizer.pitch == pytest.approx(2 / CELLS, rel=0.02)
 
 
+@pytest.mark.slow
 def test_how_often_and_how_much_is_queried(kit, aabb):
     field = voxels(kit)
     regularizer, given = build(kit, aabb, every=2), build(kit, aabb, every=2, field_pitch=2 / CELLS)
@@ -62,6 +63,7 @@ def test_how_often_and_how_much_is_queried(kit, aabb):
     assert max(estimated) <= 200_000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", [0.0, 0.01])
 def test_a_field_that_is_even_at_first_is_estimated_later(kit, aabb, start):
     field = kit.field(torch.full((CELLS,) * 3, start))
@@ -78,6 +80,7 @@ def test_a_field_that_is_even_at_first_is_estimated_later(kit, aabb, start):
     assert regularizer.pitch == pytest.approx(2 / CELLS, rel=0.02)
 
 
+@pytest.mark.slow
 def test_a_field_that_is_refined_is_followed(kit, aabb):
     regularizer = build(kit, aabb)
     regularizer(voxels(kit, cells=CELLS))
@@ -85,6 +88,7 @@ def test_a_field_that_is_refined_is_followed(kit, aabb):
     assert regularizer.pitch == pytest.approx(1 / CELLS, rel=0.02)
 
 
+@pytest.mark.slow
 def test_a_failed_estimate_does_not_replace_a_good_one(kit, aabb):
     regularizer = build(kit, aabb)
     regularizer(voxels(kit))
@@ -92,6 +96,7 @@ def test_a_failed_estimate_does_not_replace_a_good_one(kit, aabb):
     assert regularizer.pitch_estimate.source == "cells"
 
 
+@pytest.mark.slow
 def test_without_cells_the_fallback_is_warned_of_once_and_in_time(kit, aabb):
     regularizer, field = build(kit, aabb), ball(torch.tensor(80.0, requires_grad=True))
     for _ in range(PATIENCE):
@@ -156,6 +161,7 @@ def test_invalid_densities_are_refused_or_dropped_as_everywhere(kit, aabb):
     assert bool(torch.isfinite(losses["dsds"]))
 
 
+@pytest.mark.slow
 def test_a_resumed_run_goes_on_with_it(kit, aabb):
     field, first = voxels(kit), build(kit, aabb)
     for _ in range(6):
