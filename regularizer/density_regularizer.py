@@ -144,6 +144,7 @@ class DensityRegularizer:
         self.lines = self._sight_lines_of(points)
         self._viewing = viewing_cameras(cameras, denoiser.manifest.channels)
         self._rays = FollowedRays(denoiser.manifest.channels, cameras, self.aabb, every=s.light_steps)
+        self._seen: dict[str, Any] = {}  # cubes, skipped, lowest and highest density of the first field
         self.step = 0
         self.report: Counter[str] = Counter()
         self.totals: Counter[str] = Counter()
@@ -325,6 +326,8 @@ class DensityRegularizer:
         )
         self.report.update(cubes=s.cubes, voxels=cubes.inside.numel(), outside=int((~cubes.inside).sum()))
         losses = [self._dsds_of_field(field, cubes, index) for index, field in enumerate(fields)]
+        if s.skip_empty:
+            self._watch.note(**self._seen, pitch=self.pitch)
         return torch.stack(losses).sum() * s.dsds_weight
 
     def _dsds_of_field(self, field: DensityFn, cubes: CubeBatch, index: int) -> Tensor:
@@ -357,7 +360,7 @@ class DensityRegularizer:
         self.report.update(denoised=len(asked) - skipped, skipped_empty=skipped)
         if index == 0 and s.skip_empty:
             lowest, highest = (float(value) for value in torch.aminmax(density))
-            self._watch.note(cubes=len(asked), skipped=skipped, lowest=lowest, highest=highest, pitch=self.pitch)
+            self._seen = {"cubes": len(asked), "skipped": skipped, "lowest": lowest, "highest": highest}
         if not bool(asked.any()):
             return x0_pred
         if len(self.denoiser.manifest.channels) > 1:

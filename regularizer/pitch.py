@@ -155,5 +155,5 @@ class SkipWatch:
             f"DensityRegularizer: {share:.0%} of the cubes of {WINDOW} steps were skipped as empty, although the field "
             f"holds matter: none of their voxels has {measure} above {self.rule.threshold}; check field_pitch, the "
             f"side of the field's cells, and rule",
-            stacklevel=6,
+            stacklevel=4,
         )
