@@ -101,8 +101,11 @@ def test_without_cells_the_fallback_is_warned_of_once_and_in_time(kit, aabb):
     regularizer, field = build(kit, aabb), ball(torch.tensor(80.0, requires_grad=True))
     for _ in range(PATIENCE):
         regularizer(field)
-    with pytest.warns(UserWarning, match=r"field_pitch is not known .* sharp edges; 0.01562 is used, .*: pass field_p"):
+    with pytest.warns(
+        UserWarning, match=r"field_pitch is not known .* sharp edges; 0.01562 is used, .*: pass field_p"
+    ) as caught:
         regularizer(field)
+    assert caught[0].filename == __file__
     assert regularizer.pitch == 2 / 128
     for _ in range(5):  # the test run turns warnings into errors
         regularizer(field)
@@ -207,8 +210,9 @@ def test_nearly_all_cubes_skipped_is_a_warning_that_names_the_pitch_and_the_rule
         regularizer(ball(level))
     with pytest.warns(
         UserWarning, match=r"100% of the cubes of 25 steps .* holds matter.* 0.001 above 0.1; check field"
-    ):
+    ) as caught:
         regularizer(ball(level))
+    assert caught[0].filename == __file__
     for _ in range(WINDOW):
         regularizer(ball(level))
 
