@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from .pipeline import Judgement as Judgement
     from .pipeline import clean as clean
     from .pipeline import judge as judge
+    from .pitch_estimation import PitchEstimate as PitchEstimate
+    from .pitch_estimation import estimate_pitch as estimate_pitch
     from .queries import field_device as field_device
     from .queries import make_query as make_query
     from .splats import CleanedSplats as CleanedSplats
@@ -35,6 +37,7 @@ __getattr__, __dir__, __all__ = attach(
         ".grid_channels": ["light_channel", "light_maps", "view_channel", "viewing_cameras"],
         ".keep_mask": ["KeepMask"],
         ".pipeline": ["Judgement", "clean", "judge"],
+        ".pitch_estimation": ["PitchEstimate", "estimate_pitch"],
         ".queries": ["field_device", "make_query"],
         ".splats": ["CleanedSplats", "box_of", "clean_ply", "clean_splats", "pitch_of"],
         ".strength": ["choose_strength"],

@@ -51,7 +51,7 @@ def main() -> None:
     field = VoxelField(density)
     optimizer = torch.optim.Adam(field.parameters(), lr=0.4)  # raw values reach 60: they have far to go
 
-    regularizer = DensityRegularizer(load_denoiser(), aabb=AABB, field_pitch=PITCH, cubes=8)
+    regularizer = DensityRegularizer(load_denoiser(), aabb=AABB, cubes=8)
     for step in range(180):
         loss = sum(regularizer(field.density_fn).values(), torch.zeros(()))  # add it to your photometric loss
         optimizer.zero_grad()

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..cleaning.grid_channels import light_channel, light_maps, view_channel
+from ..cleaning.grid_channels import evidence_channels, light_channel, light_maps, view_channel
 from ..core.aabb import contains
 from ..core.arrays import to_numpy, widest
 from ..core.cameras import Cameras
@@ -24,6 +24,7 @@ from ..core.channels import (
     surroundings_lattice,
 )
 from ..core.occupancy import EMPTY, OccupancyRule
+from ..core.sight_lines import SightLines
 from ..core.visibility.transmittance import TransmittanceMaps
 from .cubes import CubeBatch
 
@@ -89,6 +90,7 @@ def complete_channels(
     *,
     viewing: Cameras | None,
     maps: TransmittanceMaps | None,
+    lines: SightLines | None,
     surroundings: Callable[[], NDArray[np.float32]],
 ) -> Tensor:
     """All channels of the cubes that are asked about; what cannot be told is unknown.
@@ -99,6 +101,7 @@ def complete_channels(
         cubes, asked: as :func:`cube_surroundings` has them.
         viewing: cameras to count, or None.
         maps: rays through the field, or None.
+        lines: sight lines on a grid of the field's pitch, or None.
         surroundings: called if the denoiser wants them.
 
     Returns:
@@ -109,6 +112,8 @@ def complete_channels(
         known[VIEW_COUNT] = view_channel(viewing, *frames)
     if maps is not None:
         known[TRANSMITTANCE] = light_channel(maps, *frames)
+    if lines is not None:
+        known |= evidence_channels(lines, *frames)
     if SURROUNDINGS in names:
         known[SURROUNDINGS] = encode_surroundings(surroundings())
     nothing = np.broadcast_to(np.float32(EMPTY), (len(signed), *signed.shape[2:]))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,10 +13,9 @@ from torch import Tensor
 from ..core.aabb import scene_extent
 from ..core.errors import InvalidArgument
 from ..core.frames import random_rotations, unit_lattice
+from .pitch import FieldPitch
 from .proposals import ImportanceGrid, sample_edges
 from .settings import RegularizerSettings
-
-FieldPitch = float | Callable[[NDArray[np.float64]], NDArray[np.float64]] | None
 
 GRID_STRIDE = 4  # every fourth voxel of a cube refreshes the importance grid
 

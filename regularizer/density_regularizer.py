@@ -21,7 +21,8 @@ except ImportError as error:  # pragma: no cover - exercised in a subprocess
     raise MissingExtra("unghost.regularizer.density_regularizer needs torch: pip install unghost[torch]") from error
 
 from ..cleaning.denoiser_calls import check_denoiser, run_denoiser
-from ..cleaning.grid_channels import viewing_cameras
+from ..cleaning.grid_channels import evidence_lines, viewing_cameras
+from ..cleaning.pitch_estimation import PitchEstimate
 from ..cleaning.queries import field_device
 from ..core.aabb import as_aabb, scene_extent
 from ..core.arrays import to_numpy, upcast, widest
@@ -32,7 +33,7 @@ from ..core.schedule import check_timestep
 from ..core.sight_lines import MARGIN_CELLS, SightLines
 from ..core.sparse_points import SparsePoints, warn_if_not_in_view
 from .cube_channels import FollowedRays, complete_channels, cube_surroundings
-from .cubes import CubeBatch, FieldPitch, draw_cubes, wide_dtype
+from .cubes import CubeBatch, draw_cubes, wide_dtype
 from .losses import (
     cube_parts,
     cubewise_mean,
@@ -42,12 +43,13 @@ from .losses import (
     stable_mean,
     visibility_loss,
 )
+from .pitch import FieldPitch, PitchSource, SkipWatch
 from .proposals import ImportanceGrid
 from .settings import SURE, RegularizerSettings
 from .tensor_queries import DensityFn, query_tensors
 from .visibility import ViewCounter, grow_box, visibility_points
 
-NOMINAL_CELLS = 128  # a field whose pitch is unknown is taken to have this many cells along the longest side
+LINES_MOVE = 0.2  # change of the logarithm of the pitch after which sight lines are traced anew
 MOST_LINE_CELLS = 192  # along the longest side of the grid on which sight lines and points outvote each other
 LOSSES = ("dsds", "visibility", "sight_lines")
 POINTS_PER_CELL = 4  # asked of the field to fill the importance grid at the first call
@@ -80,12 +82,15 @@ class DensityRegularizer:
         points: of the training photos, in the frame of ``cameras``, whose indices its observations use; None for no
             sight-line loss. For anything that is scored, triangulated from the training photos alone.
         field_pitch: side of the field's own cells in scene units, or a function of cube centres ``(N, 3)``
-            that gives it as ``(N,)`` (a contracted field); None if unknown: then the cube's voxel.
+            that gives it as ``(N,)`` (a contracted field); None to estimate it from the first field, with at most
+            200,000 densities at acting calls 0, 1, 2, 4, 8, … (:func:`unghost.cleaning.estimate_pitch`).
         device: where positions are created; None for the device of the field's parameters, else the CPU.
         settings: see :class:`RegularizerSettings`; ``overrides`` replace single ones.
 
     Attributes:
         grid: the importance grid.
+        pitch: side of the field's cells that is used, scene units; of a function, its median.
+        pitch_estimate: where ``pitch`` comes from; None if it was given, or before the first call.
         step: calls so far; cubes of step s depend on (seed, s) and the grid alone.
         report: counts of the last call: cubes, skipped_empty, denoised, voxels, outside, dropped, points, unseen,
             lines.
@@ -119,10 +124,8 @@ class DensityRegularizer:
         self.settings = override(settings or RegularizerSettings(), overrides, caller="DensityRegularizer")
         self.aabb = as_aabb(aabb, caller="DensityRegularizer")
         self.denoiser = check_denoiser(denoiser, caller="DensityRegularizer")
-        if field_pitch is not None and not callable(field_pitch) and not 0 < field_pitch < np.inf:
-            raise InvalidArgument(f"DensityRegularizer: field_pitch must be finite and > 0, got {field_pitch}")
-        self.field_pitch, self.device, self.cameras = field_pitch, device, cameras
-        s = self.settings
+        s, self.device, self.cameras = self.settings, device, cameras
+        self._pitch, self._watch = PitchSource(field_pitch, self.aabb), SkipWatch(self.settings.rule, self.aabb)
         self.threshold = denoiser.manifest.removal_threshold if s.threshold is None else s.threshold
         self.fill_threshold = max(self.threshold, SURE) if s.fill_threshold is None else s.fill_threshold
         if self.fill_threshold < self.threshold:
@@ -137,9 +140,12 @@ class DensityRegularizer:
             warn_if_turned_away(cameras, self.aabb, caller="DensityRegularizer")
             reach = grow_box(self.aabb, s.visibility_reach)
             self._views = ViewCounter(cameras, min_views=s.min_views, aabb=reach, depth_maps=depth_maps)
+        self._points = points
         self.lines = self._sight_lines_of(points)
+        self._evidence = self._evidence_of(points)
         self._viewing = viewing_cameras(cameras, denoiser.manifest.channels)
         self._rays = FollowedRays(denoiser.manifest.channels, cameras, self.aabb, every=s.light_steps)
+        self._seen: dict[str, Any] = {}  # cubes, skipped, lowest and highest density of the first field
         self.step = 0
         self.report: Counter[str] = Counter()
         self.totals: Counter[str] = Counter()
@@ -168,7 +174,10 @@ class DensityRegularizer:
                 raise InvalidType(f"DensityRegularizer: density_fn must be callable, got {type(field).__name__}")
         device = torch.device(self.device if self.device is not None else field_device(fields[0]) or "cpu")
         self.report = Counter()
-        if self.step % self.settings.every:
+        acts = self.step % self.settings.every == 0
+        if acts and self._needs_pitch():
+            self._refresh_pitch(fields[0], device)
+        if not acts:
             losses = {name: torch.zeros((), dtype=wide_dtype(device), device=device) for name in LOSSES}
         else:
             losses = {
@@ -182,7 +191,6 @@ class DensityRegularizer:
 
     def _sight_lines_of(self, points: SparsePoints | None) -> SightLines | None:
         """Lines in the box that the visibility loss reaches, and beyond; the loss may ask the field anywhere there."""
-        s = self.settings
         if points is None:
             return None
         if self.cameras is None:
@@ -193,10 +201,7 @@ class DensityRegularizer:
                 f"got camera {int(points.camera.max())}"
             )
         warn_if_not_in_view(points, self.cameras, caller="DensityRegularizer")
-        box, cell = grow_box(self.aabb, s.visibility_reach), self._nominal_pitch()
-        pitch = max(cell, scene_extent(box) / MOST_LINE_CELLS)
-        reach = max(s.sight_line_reach / s.visibility_reach, 1.0)
-        lines = SightLines.build(points, self.cameras, aabb=box, pitch=pitch, field_pitch=cell, reach=reach)
+        lines = self._build_lines(points, self.cameras)
         if not len(lines):
             warnings.warn(
                 f"DensityRegularizer: the sight-line loss is 0, as no line is left of {len(points)} points with "
@@ -204,6 +209,17 @@ class DensityRegularizer:
                 stacklevel=4,
             )
         return lines
+
+    def _build_lines(self, points: SparsePoints, cameras: Cameras) -> SightLines:
+        box = grow_box(self.aabb, self.settings.visibility_reach)
+        pitch = max(self.pitch, scene_extent(box) / MOST_LINE_CELLS)
+        reach = max(self.settings.sight_line_reach / self.settings.visibility_reach, 1.0)
+        return SightLines.build(points, cameras, aabb=box, pitch=pitch, field_pitch=self.pitch, reach=reach)
+
+    def _evidence_of(self, points: SparsePoints | None) -> SightLines | None:
+        """Lines on a grid of the field's own pitch over the box, for a denoiser that sees support and crossings."""
+        names = self.denoiser.manifest.channels
+        return evidence_lines(names, points, self.cameras, aabb=self.aabb, pitch=self.pitch)
 
     def observe(self, positions: Any, values: Any, *, kind: Literal["density", "weight"] = "density") -> None:
         """Tell the importance grid what you rendered anyway; never needed, always cheap.
@@ -218,15 +234,20 @@ class DensityRegularizer:
         amounts, points = _as_float64(values), _as_float64(positions)
         if kind == "density" and self.settings.rule.kind == "opacity":
             valid = np.where(np.isfinite(amounts) & (amounts >= 0), amounts, 0.0)
-            amounts = np.where(valid == amounts, opacity_from_density(valid, self._nominal_pitch()), amounts)
+            amounts = np.where(valid == amounts, opacity_from_density(valid, self.pitch), amounts)
         self.totals["observations_outside"] += self.grid.observe(points, amounts)
 
     def state_dict(self) -> dict[str, Any]:
-        """What a resumed run needs: step, grid values, which cells were observed."""
-        return {"step": self.step, "values": self.grid.values.copy(), "observed": self.grid.observed.copy()}
+        """What a resumed run needs: step, grid values, which cells were observed, the estimated pitch."""
+        return {
+            "step": self.step,
+            "values": self.grid.values.copy(),
+            "observed": self.grid.observed.copy(),
+            "pitch": self._pitch.state(),
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Inverse of :meth:`state_dict`."""
+        """Inverse of :meth:`state_dict`; one that has no pitch yet leaves it to be estimated."""
         if np.shape(state["values"]) != self.grid.values.shape:
             raise InvalidArgument(
                 f"DensityRegularizer.load_state_dict: values must have shape {self.grid.values.shape}, "
@@ -234,15 +255,44 @@ class DensityRegularizer:
             )
         self.step = int(state["step"])
         self.grid.values, self.grid.observed = np.array(state["values"], float), np.array(state["observed"], bool)
+        if "pitch" in state:
+            self._pitch.load(state["pitch"])
 
     def _rng(self, stream: int) -> np.random.Generator:
         return np.random.default_rng([self.settings.seed, self.step, stream])
 
-    def _nominal_pitch(self) -> float:
-        """Cell side for points that belong to no cube."""
-        if isinstance(self.field_pitch, (int, float)):
-            return float(self.field_pitch)
-        return scene_extent(self.aabb) / NOMINAL_CELLS
+    @property
+    def pitch(self) -> float:
+        """Side of the field's cells that is used, scene units; 1/128 of the longest side until it is estimated."""
+        return self._pitch.nominal
+
+    @property
+    def pitch_estimate(self) -> PitchEstimate | None:
+        """Where ``pitch`` comes from; None if it was given, or before the first call."""
+        return self._pitch.estimate
+
+    def _needs_pitch(self) -> bool:
+        """Whether any loss that is on depends on it: the paper's do not."""
+        s, by_opacity = self.settings, self.settings.rule.kind == "opacity"
+        cubes = by_opacity or s.edge_range is None or len(self.denoiser.manifest.channels) > 1
+        views = self._views is not None and s.visibility_weight > 0 and s.visibility_samples > 0
+        lines = self.lines is not None and s.sight_lines > 0 and max(s.sight_line_weight, s.end_point_weight) > 0
+        return (s.dsds_weight > 0 and s.cubes > 0 and cubes) or (views and by_opacity) or lines
+
+    def _refresh_pitch(self, field: DensityFn, device: torch.device) -> None:
+        """Estimate an unknown pitch where it is due; sight lines end a number of cells before their points."""
+
+        @torch.no_grad()
+        def query(places: NDArray[Any]) -> NDArray[Any]:
+            s, positions = self.settings, torch.as_tensor(places, dtype=torch.float32, device=device)
+            density, valid = query_tensors(field, positions, chunk=s.chunk, drop_invalid=s.drop_invalid)
+            return to_numpy(torch.where(valid, widest(density), torch.full_like(widest(density), torch.nan)))
+
+        before = self.pitch
+        self._pitch.refresh(query, self._rng(5))
+        if self._points is not None and self.cameras is not None and abs(np.log(self.pitch / before)) > LINES_MOVE:
+            self.lines = self._build_lines(self._points, self.cameras)
+            self._evidence = self._evidence_of(self._points)
 
     def _query(self, field: DensityFn, positions: Tensor) -> tuple[Tensor, Tensor]:
         """Densities ``(M,)`` at ``(M, 3)``, in chunks, and which of them are valid (all, unless dropping)."""
@@ -258,7 +308,7 @@ class DensityRegularizer:
         positions = torch.as_tensor(points, dtype=torch.float32, device=device)
         with torch.no_grad():
             density, valid = self._query(field, positions)
-        self._refresh(positions[valid], density[valid], self._nominal_pitch())
+        self._refresh(positions[valid], density[valid], self.pitch)
         lowest, highest = (float(value) for value in torch.aminmax(density))
         warn_if_constant(lowest, highest, len(density), caller="DensityRegularizer")
 
@@ -278,12 +328,14 @@ class DensityRegularizer:
             self.grid,
             self._rng(0),
             s,
-            field_pitch=self.field_pitch,
+            field_pitch=self._pitch.of_cubes,
             resolution=self.denoiser.manifest.resolution,
             device=device,
         )
         self.report.update(cubes=s.cubes, voxels=cubes.inside.numel(), outside=int((~cubes.inside).sum()))
         losses = [self._dsds_of_field(field, cubes, index) for index, field in enumerate(fields)]
+        if s.skip_empty:
+            self._watch.note(**self._seen, pitch=self.pitch)
         return torch.stack(losses).sum() * s.dsds_weight
 
     def _dsds_of_field(self, field: DensityFn, cubes: CubeBatch, index: int) -> Tensor:
@@ -312,7 +364,11 @@ class DensityRegularizer:
         s = self.settings
         x0_pred = torch.full_like(density, EMPTY, dtype=torch.float32)
         asked, channels = self._shown(density, cubes)
-        self.report.update(denoised=int(asked.sum()), skipped_empty=int((~asked).sum()))
+        skipped = int((~asked).sum())
+        self.report.update(denoised=len(asked) - skipped, skipped_empty=skipped)
+        if index == 0 and s.skip_empty:
+            lowest, highest = (float(value) for value in torch.aminmax(density))
+            self._seen = {"cubes": len(asked), "skipped": skipped, "lowest": lowest, "highest": highest}
         if not bool(asked.any()):
             return x0_pred
         if len(self.denoiser.manifest.channels) > 1:
@@ -326,7 +382,8 @@ class DensityRegularizer:
                 cubes,
                 asked,
                 viewing=self._viewing,
-                maps=self._rays.through(ask, index=index, step=self.step, pitch=self._nominal_pitch(), like=density),
+                maps=self._rays.through(ask, index=index, step=self.step, pitch=self.pitch, like=density),
+                lines=self._evidence,
                 surroundings=lambda: cube_surroundings(ask, cubes, asked, aabb=self.aabb, rule=s.rule, soft=s.soft),
             )
         t = s.timestep(self.step) if callable(s.timestep) else s.timestep
@@ -371,7 +428,7 @@ class DensityRegularizer:
         total = zero
         for field in fields:  # seen points add nothing, so the field is not asked about them
             density, valid = self._query(field, positions)
-            depth = widest(density) * self._nominal_pitch() if s.rule.kind == "opacity" else density
+            depth = widest(density) * self.pitch if s.rule.kind == "opacity" else density
             loss = visibility_loss(depth, views, min_views=s.min_views)
             total = total + stable_mean(torch.where(valid, loss, torch.zeros_like(loss)), count=len(points))
         return total * s.visibility_weight
@@ -390,7 +447,7 @@ class DensityRegularizer:
                 density = self._on_lines(field, places, device)
                 total = total + stable_mean(sight_line_loss(density, length)) * s.sight_line_weight
         if s.end_point_weight > 0:
-            reach = MARGIN_CELLS * self._nominal_pitch()
+            reach = MARGIN_CELLS * self.pitch
             places, covered = lines.sample_ends(self._rng(4), s.sight_lines, reach=reach)
             for field in fields if len(places) else ():
                 density = self._on_lines(field, places, device)

@@ -28,7 +28,7 @@ class RegularizerSettings:
         cubes: cubes a step (40: the paper).
         every: calls from one that does something to the next; those between cost nothing and return zeros.
         edge_range: lowest and highest cube edge as fractions of the scene extent; None: .5-1.25 field cells a
-            voxel where ``field_pitch`` is known, else the paper's .01-.1.
+            voxel (.01-.1: the paper).
         rotate: turn every cube at random (uniform on SO(3)); False keeps the scene's axes.
         strategy: ``"mixed"``, ``"importance"`` or ``"uniform"`` cube centres.
         uniform_share: of the mixed strategy, in [0, 1].

@@ -169,7 +169,7 @@ def step_cost(model: Any, calls: int = 3) -> dict[str, float]:
     from unghost.regularizer.density_regularizer import DensityRegularizer
 
     first, seconds = model.regularizer, []
-    full = DensityRegularizer(first.denoiser, aabb=first.aabb, cameras=first.cameras)
+    full = DensityRegularizer(first.denoiser, aabb=first.aabb, cameras=first.cameras, field_pitch=first.pitch)
     for _ in range(calls):
         begun = time.perf_counter()
         sum(full(model.density_fields()).values()).backward()  # type: ignore[union-attr]

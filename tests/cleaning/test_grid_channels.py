@@ -25,6 +25,7 @@ from unghost.regularizer.cubes import draw_cubes
 from unghost.regularizer.density_regularizer import DensityRegularizer
 
 PITCH = 0.05
+NO_LINE_LOSS = {"sight_line_weight": 0.0, "end_point_weight": 0.0}
 SWAPPED = ("signed_opacity", "view_count", "surroundings", "transmittance")
 
 
@@ -211,13 +212,14 @@ def test_cleaning_tells_all_it_knows(kit, aabb, crowd, kind):
 
 def build(kit, aabb, names, cameras=None, **options):
     denoiser = kit.torch_denoiser(keep_first, channels=names)
-    settings = {"cubes": 5, "field_pitch": PITCH, "visibility_weight": 0.0, "seed": 3} | options
+    settings = {"cubes": 5, "field_pitch": PITCH, "visibility_weight": 0.0, "seed": 3, **NO_LINE_LOSS} | options
     return DensityRegularizer(denoiser, aabb=aabb, cameras=cameras, **settings), denoiser
 
 
 @pytest.mark.parametrize("rotate", [False, True])
 def test_the_regularizer_tells_all_it_knows(kit, aabb, crowd, rotate):
-    regularizer, denoiser = build(kit, aabb, CHANNEL_NAMES, crowd, rotate=rotate)
+    points = observed(crowd)
+    regularizer, denoiser = build(kit, aabb, CHANNEL_NAMES, crowd, rotate=rotate, points=points)
     regularizer.observe(unit_lattice(8) * 1.9, np.ones((8, 8, 8)))
     cubes = draw_cubes(
         regularizer.grid,
@@ -232,6 +234,12 @@ def test_the_regularizer_tells_all_it_knows(kit, aabb, crowd, rotate):
     assert given.shape == (5, len(CHANNEL_NAMES), 32, 32, 32)
     turns = cubes.rotations if rotate else np.broadcast_to(np.eye(3), (5, 3, 3))
     np.testing.assert_array_equal(given[:, 2], encode_view_count(count_views(crowd, cubes.centers, cubes.edges, turns)))
+    lines = evidence_lines(CHANNEL_NAMES, points, crowd, aabb=aabb, pitch=PITCH)
+    lattice = cube_lattices(cubes.centers, cubes.edges, turns)
+    for place, name in ((4, "support"), (5, "crossings")):
+        share = encode_share(evidence_share(getattr(lines, name)(lattice)))
+        np.testing.assert_allclose(given[:, place], share, atol=1e-5)
+        assert share.std() > 0.02
     shown = torch.from_numpy(waves(cubes.positions.numpy()) * PITCH)
     told = torch.where(cubes.inside, 1 - 2 * torch.exp(-shown), -1.0)
     np.testing.assert_allclose(given[:, 0], told, atol=1e-5)

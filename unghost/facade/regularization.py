@@ -12,8 +12,8 @@ from ..core.cameras import Cameras
 from ..core.manifest import Denoiser
 from ..core.sparse_points import SparsePoints
 from ..denoisers import load_denoiser
-from ..regularizer.cubes import FieldPitch
 from ..regularizer.density_regularizer import DensityRegularizer as RequiredDenoiserRegularizer
+from ..regularizer.pitch import FieldPitch
 from ..regularizer.settings import RegularizerSettings
 
 
@@ -29,7 +29,7 @@ class DensityRegularizer(RequiredDenoiserRegularizer):
         points: sparse points of the training photos, in the frame of ``cameras``; None switches the sight-line loss
             off.
         field_pitch: side of the field's own cells, scene units, or a function of cube centres ``(N, 3)`` that returns
-            it as ``(N,)`` (a contracted field); None uses the cube's voxel.
+            it as ``(N,)`` (a contracted field); None estimates it from the field (``pitch_estimate`` says how).
         device: where positions are created; None for the device of the field's parameters, else the CPU.
         cubes: cubes a step (40: the paper).
         every: act on every n-th call only; the calls between cost nothing and return zeros.

@@ -9,10 +9,12 @@ from ...core.lazy import attach
 if TYPE_CHECKING:
     from .model import UnghostNerfactoModelConfig as UnghostNerfactoModelConfig
     from .model import cameras_of as cameras_of
+    from .pitch import hash_pitch as hash_pitch
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
         ".model": ["UnghostNerfactoModelConfig", "cameras_of"],
+        ".pitch": ["hash_pitch"],
     },
 )

@@ -14,6 +14,7 @@ from nerfstudio.models.nerfacto import NerfactoModel, NerfactoModelConfig
 
 from ...core.cameras import Cameras
 from ...core.errors import InvalidArgument
+from .pitch import hash_pitch
 
 
 @dataclass
@@ -31,6 +32,8 @@ class UnghostNerfactoModelConfig(NerfactoModelConfig):  # type: ignore[misc]
     """Of the score distillation; 0 switches it off."""
     unghost_visibility_weight: float = 1.0
     """Of the density where no photo looks; 0 switches it off."""
+    unghost_field_pitch: float | None = None
+    """Side of a cell that opacities are measured over, scene units; None for that of the finest hash level."""
     unghost_denoiser: str = "default"
     """A shipped prior, or a model.safetensors."""
 
@@ -103,10 +106,13 @@ class UnghostNerfactoModel(NerfactoModel):  # type: ignore[misc]
         denoiser = load_denoiser(name, backend=None if "." in name else "torch")
         if denoiser.kind == "torch":
             denoiser = denoiser.to(self.device)
+        aabb, pitch = self.scene_box.aabb.double().cpu().numpy(), c.unghost_field_pitch
+        own = hash_pitch(c.max_res, aabb, contracted=not c.disable_scene_contraction)
         self.regularizer = DensityRegularizer(
             denoiser,
-            aabb=self.scene_box.aabb.cpu().numpy(),
+            aabb=aabb,
             cameras=cameras_of(cameras),
+            field_pitch=own if pitch is None else pitch,
             cubes=c.unghost_cubes,
             dsds_weight=c.unghost_dsds_weight,
             visibility_weight=c.unghost_visibility_weight,
