@@ -86,11 +86,12 @@ def simulate_sparse_points(
     places, first = places[detected], first[detected]
     point, camera = _observations(rng, photographed, places, first, rng.uniform(*settings.repeatability))
     noise = float(rng.uniform(*settings.noise)) / factor
-    points = _triangulated(rng, photographed, places, point, camera, noise, factor)
+    true, told = photographed.true_cameras, photographed.cameras
+    points = triangulate_noisy(rng, places, point, camera, true=true, told=told, noise=noise, factor=factor)
     if len(points) > wanted:
         points = points.select(np.sort(rng.choice(len(points), wanted, replace=False)))
     matched = photographed.cameras.resized(factor)  # errors and uncertainties are of pixels of the matched photos
-    return _with_wrong(rng, points, matched, log_uniform(rng, *settings.wrong))
+    return with_wrong_points(rng, points, matched, log_uniform(rng, *settings.wrong))
 
 
 def _candidates(rng: np.random.Generator, photographed: PhotographedScene, wanted: int) -> tuple[Array, Array, Array]:
@@ -176,17 +177,28 @@ def _observations(
     return np.concatenate(point), np.concatenate(camera)
 
 
-def _triangulated(
+def triangulate_noisy(
     rng: np.random.Generator,
-    photographed: PhotographedScene,
     places: Array,
     point: Array,
     camera: Array,
+    *,
+    true: Cameras,
+    told: Cameras,
     noise: float,
-    factor: float,
+    factor: float = 1.0,
 ) -> SparsePoints:
-    """Triangulate noisy keypoints with the cameras that a field is given; noise in pixels of the small photos."""
-    true, told = photographed.true_cameras, photographed.cameras
+    """Triangulate noisy keypoints of known places, and drop what COLMAP would.
+
+    Args:
+        rng: source of the noise.
+        places: ``(P, 3)``.
+        point, camera: ``(M,)`` observations.
+        true: cameras that took the photos.
+        told: cameras that the points are triangulated with.
+        noise: standard deviation of a keypoint, pixels of these cameras.
+        factor: pixels of the matched photos for one of theirs.
+    """
     keypoints, directions = np.zeros((len(point), 2)), np.zeros((len(point), 3))
     for index in range(len(true)):
         mine = camera == index
@@ -240,8 +252,15 @@ def _widest_angle(origins: Array, xyz: Array, point: Array, count: int) -> Array
     return 2 * widest
 
 
-def _with_wrong(rng: np.random.Generator, points: SparsePoints, cameras: Cameras, share: float) -> SparsePoints:
-    """The points and some wrong ones: at a random depth on the ray of a real keypoint, as epipolar lines allow."""
+def with_wrong_points(rng: np.random.Generator, points: SparsePoints, cameras: Cameras, share: float) -> SparsePoints:
+    """The points and some wrong ones: at a random depth on the ray of a real keypoint, as epipolar lines allow.
+
+    Args:
+        rng: source of every draw.
+        points: right ones.
+        cameras: of the matched photos.
+        share: of wrong points among all, in [0, 1).
+    """
     count = round(share / (1 - share) * len(points))
     if not count or not len(points.point):
         return points
