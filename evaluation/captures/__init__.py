@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from .loading import Capture as Capture
     from .loading import load_cameras as load_cameras
     from .loading import load_capture as load_capture
+    from .loading import load_points as load_points
     from .nerfstudio import write_nerfstudio as write_nerfstudio
     from .points import read_points as read_points
     from .posing import PosingSettings as PosingSettings
@@ -29,7 +30,7 @@ __getattr__, __dir__, __all__ = attach(
         ".colmap": ["find_model"],
         ".creation": ["make_capture"],
         ".difficulty": ["difficulty_rows", "difficulty_text", "every_nth"],
-        ".loading": ["Capture", "load_cameras", "load_capture"],
+        ".loading": ["Capture", "load_cameras", "load_capture", "load_points"],
         ".nerfstudio": ["write_nerfstudio"],
         ".points": ["read_points"],
         ".posing": ["PosingSettings"],

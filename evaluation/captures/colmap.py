@@ -75,6 +75,11 @@ def _ending(folder: Path) -> str | None:
     return None
 
 
+def has_model(folder: Path) -> bool:
+    """Whether a folder itself is a sparse model: ``cameras`` and ``images``, ``.bin`` or ``.txt``."""
+    return folder.is_dir() and _ending(folder) is not None
+
+
 def find_model(folder: Path) -> Path | None:
     """The model that a folder is, or that lies in ``sparse`` or ``colmap/sparse``; None if there is none.
 

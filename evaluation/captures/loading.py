@@ -21,12 +21,13 @@ from ...core.cameras import Cameras
 from ...core.errors import InvalidArgument, InvalidFile, MissingFile
 from ...core.io import read_json
 from ...core.sparse_points import SparsePoints, warn_if_not_in_view
-from .colmap import find_model, image_names, read_model
+from .alignment import align_poses
+from .colmap import find_model, has_model, image_names, read_model
 from .dataparser import applied_motion, find_dataparser, into_the_trained_world, warn_if_exported
 from .inria import FILE as INRIA_FILE
 from .inria import cameras_as_frames
 from .photos import RESIZED, find_photos, fit_frames, photo_sizes, read_photo, report_missing
-from .points import PLY_KEY, has_points, points_folder, read_point_cloud, read_points
+from .points import PLY_KEY, has_points, points_folder, positions_of, read_point_cloud, read_points
 from .splits import Splits, resolve_splits
 from .transforms import has_split_files, read_frames, read_lens, read_object, read_split_files
 
@@ -313,7 +314,58 @@ def load_cameras(path: str | Path, *, dataparser: str | Path | bool = True, scen
         FileNotFoundError: there is none.
         ValueError: what is wrong with the file.
     """
-    place = Path(path)
+    return _named_cameras(Path(path), dataparser, scene)[0]
+
+
+def load_points(
+    path: str | Path | None,
+    cameras: str | Path,
+    *,
+    dataparser: str | Path | bool = True,
+    scene: str | Path | None = None,
+) -> SparsePoints | None:
+    """The sparse points of a COLMAP model, in the world of :func:`load_cameras` and with its cameras' indices.
+
+    The model's world may be another one (scaled, turned and shifted alike): photos are found by name, and the
+    similarity follows from their poses in both.
+
+    Args:
+        path: a COLMAP model with points, or a folder that holds one (``sparse/0`` and so on). None for the one beside
+            ``cameras``, if there is one.
+        cameras, dataparser, scene: as :func:`load_cameras` takes them.
+
+    Returns:
+        The points; None if ``path`` is None and there is no model with points.
+
+    Raises:
+        FileNotFoundError: ``path`` holds no model with points.
+        ValueError: a broken model, or one whose photos are not among the cameras, or posed otherwise.
+    """
+    known, names, root = _named_cameras(Path(cameras), dataparser, scene)
+    place = root if path is None else Path(path)
+    model = place if has_model(place) else find_model(place)
+    if model is None or not has_points(model):
+        if path is None:
+            return None
+        raise MissingFile(f"load_points: {place} has no COLMAP model with points (cameras, images and points3D)")
+    frames = read_model(model)["frames"]
+    position = positions_of({number: frame["file_path"] for number, frame in enumerate(frames)}, names)
+    if not position:
+        raise InvalidFile(f"load_points: no photo of {model} is among the {len(names)} cameras, such as {names[0]}")
+    order = list(position.values())
+    source = np.array([frames[number]["transform_matrix"] for number in position])[:, :3]
+    motion = align_poses(source, known.camera_to_world[order], label=f"load_points: {model}")
+    scale = np.ones(len(known))
+    scale[order] = [frames[number]["w"] / known.size(place)[0] for number, place in position.items()]
+    points = read_points(model, names, known, transform=motion, pixel_scale=scale)
+    warn_if_not_in_view(points, known, caller="load_points")
+    return points
+
+
+def _named_cameras(
+    place: Path, dataparser: str | Path | bool, scene: str | Path | None
+) -> tuple[Cameras, Sequence[str], Path]:
+    """The cameras of a capture alone, their photos' names, and its folder."""
     meta, file, root, colmap = _cameras_source(place)
     merged, names, poses = read_frames(meta, str(file))
     if dataparser is not False:
@@ -329,7 +381,8 @@ def load_cameras(path: str | Path, *, dataparser: str | Path | bool = True, scen
         if not all(isinstance(side, (int, float)) and 1 <= side < np.inf for side in size):
             told = f"{size[0]} x {size[1]} for {name}"
             raise InvalidFile(f"load_cameras: {file} must state one w and h in pixels for each frame, got {told}")
-    return _cameras(poses, merged, names, [(int(width), int(height)) for width, height in stated])
+    cameras = _cameras(poses, merged, names, [(int(width), int(height)) for width, height in stated])
+    return cameras, names, root
 
 
 def _cameras(

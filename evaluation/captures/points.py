@@ -171,7 +171,7 @@ def read_points(
     file = source / "points3D.bin"
     tracks = read_tracks(file if file.is_file() else source / "points3D.txt")
     known = image_names(source)
-    index_of = _positions(known, names)
+    index_of = positions_of(known, names)
     unknown = sorted(set(np.unique(tracks.image).tolist()) - set(known))
     if unknown:
         raise InvalidFile(
@@ -250,8 +250,8 @@ def read_point_cloud(
     )
 
 
-def _positions(known: dict[int, str], names: Sequence[str]) -> dict[int, int]:
-    """Image id -> position in ``names``."""
+def positions_of(known: dict[int, str], names: Sequence[str]) -> dict[int, int]:
+    """Which of ``names`` each image is: image id to position; images that are none of them are left out."""
     whole = {name: position for position, name in enumerate(names)}
     tails: dict[str, int] = {}
     for position, name in enumerate(names):

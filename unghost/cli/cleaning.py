@@ -37,7 +37,8 @@ def clean(
     mask: Path | None = None,
     keep_box: UseAppendAction[tuple[Box, ...]] = (),
     cameras: Path | None = None,
-    denoiser: str = "default",
+    points: Path | None = None,
+    denoiser: str | None = None,
     strength: float = 0.5,
     resolution: int | None = None,
     reach: float | None = None,
@@ -64,10 +65,12 @@ def clean(
         keep_box: x0 y0 z0 x1 y1 z1, scene units: nothing in this box is removed; may be given several times. With
             --mask, takes back what that removed there (the boxes of the preview's table, say).
         cameras: of the training photos, in the file's own world: transforms.json (nerfstudio's), cameras.json
-            (Inria's) or a COLMAP model; where few or none of them look, ghosts are likelier. For --denoiser views; the
-            others do not use them. The photos are not needed. A dataparser_transforms.json (nerfstudio's) beside
+            (Inria's) or a COLMAP model. The photos are not needed. A dataparser_transforms.json (nerfstudio's) beside
             either file is applied.
-        denoiser: a shipped name or an .onnx file.
+        points: a COLMAP model with sparse points, or a folder that holds one; the one beside --cameras if not given.
+            Its points and who observed them tell surfaces from ghosts.
+        denoiser: a shipped name or an .onnx file; if not given, evidence for a grid with cameras and sparse points,
+            else default.
         strength: 0 removes nothing, 0.5 what the denoiser advises, 1 everything.
         resolution: of splats, cells along the longest side of the box; by the splats' sizes if not given.
         reach: of splats, how many times the scene's core (98 % of the opacity) is cleaned (twice if not given); what
@@ -108,7 +111,10 @@ def clean(
                 raise InvalidArgument(f"clean: --mask repeats a cleaning as it was; leave out {', '.join(unused)}")
             how["mask"] = KeepMask.load(mask).restored(boxes)
         else:
-            how |= {"keep_boxes": tuple(boxes), **_judging(denoiser, threads, strength, cameras, source)}
+            if points is not None and cameras is None:
+                raise InvalidArgument("clean: --points must come with --cameras, which observed them")
+            name = denoiser or ("default" if splats else None)
+            how |= {"keep_boxes": tuple(boxes), **_judging(name, threads, strength, cameras, points, source)}
             how |= {"settings": CleanSettings(**settings)} if settings else {}
         found, density_fn = (_clean_splats if splats else _clean_grid)(source, target, **how)
     if preview:
@@ -127,17 +133,28 @@ def clean(
     print(f"cleaned: {target}" + (f"\nkeep mask: {keep}" if keep else ""))
 
 
-def _judging(denoiser: str, threads: int, strength: float, cameras: Path | None, source: Path) -> dict[str, Any]:
-    """What ``clean`` is given to judge with."""
+def _judging(
+    denoiser: str | None, threads: int, strength: float, cameras: Path | None, points: Path | None, source: Path
+) -> dict[str, Any]:
+    """What ``clean`` is given to judge with; the first line that is printed lists it."""
     from ..denoisers import load_denoiser
-    from ..evaluation.captures.loading import load_cameras
+    from ..evaluation.captures.loading import load_cameras, load_points
+    from ..facade.choice import choose_denoiser
 
-    return {
-        "denoiser": load_denoiser(denoiser, backend="onnx", threads=threads or None),
+    known = None if cameras is None else load_cameras(cameras, scene=source)
+    wanted = cameras is not None and (points is not None or denoiser in (None, "evidence"))
+    sparse = load_points(points, cameras, scene=source) if cameras is not None and wanted else None
+    name = denoiser or choose_denoiser(known, sparse)
+    about = [f"{len(known)} cameras"] if known is not None else []
+    about += [sparse.about] if sparse is not None else []
+    print(f"judging by {name}: {', '.join(['density', *about])}")
+    judging = {
+        "denoiser": load_denoiser(name, backend="onnx", threads=threads or None),
         "strength": strength,
-        "cameras": None if cameras is None else load_cameras(cameras, scene=source),
+        "cameras": known,
         "progress": StagedProgress("cube"),
     }
+    return judging if sparse is None else {**judging, "points": sparse}
 
 
 def _is_splats(source: Path) -> bool:
