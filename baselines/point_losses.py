@@ -175,8 +175,8 @@ def floater_score_loss(
         ``(...)`` float32 or as precise as ``density``.
 
     Raises:
-        ValueError: shapes that differ; counts or distances that are NaN or negative; opacities outside [0, 1]; ``reach``
-            not finite and > 0.
+        ValueError: shapes that differ; counts or distances that are NaN or negative; opacities outside [0, 1];
+            ``reach`` not finite and > 0.
 
     Example:
         >>> place = {"distance": torch.tensor(0.5), "neighbor_opacity": torch.tensor(0.2)}
