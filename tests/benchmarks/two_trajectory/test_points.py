@@ -167,9 +167,8 @@ def test_lines_are_counted_where_they_pass_and_where_they_end(job):
     assert through[0] == 0
     assert through[1] >= 1
     assert through[2] == 0
-    assert rivals.point_reach(points, cameras) == pytest.approx(
-        0.1 * np.linalg.norm(cameras.origins[:2], axis=1).mean()
-    )
+    away = np.linalg.norm(cameras.origins[:2] - goal, axis=1)
+    assert rivals.point_reach(points, cameras) == pytest.approx(0.1 * away.mean())
 
 
 @pytest.mark.slow
