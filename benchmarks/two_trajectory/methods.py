@@ -296,4 +296,3 @@ WITH_POINTS = (
 FROM_SCRATCH = ("scratch", "scratch+distortion", "scratch+sight-lines", "scratch+all")
 # equal seconds say nothing of them
 UNTRAINED = ("fitted", "photo-doubt", "bayes-rays", "components", "clean", *FROM_SCRATCH)
-AS_FITTED = ("fitted", "photo-doubt", "scratch")  # rows whose field is the fitted one

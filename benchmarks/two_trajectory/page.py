@@ -19,6 +19,7 @@ from unghost.evaluation.scoring.intervals import Interval
 
 from .compact import read_expanded
 from .figure import write_figures
+from .idle import idle_lines
 from .tables import ORDERS, REFERENCE, finished, format_rows, main_rows, per_sample, per_scene, summary_rows
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -308,7 +309,7 @@ def page(results: dict[str, Any], folder: Path) -> str:
                 ),
                 "",
             ]
-    return "\n".join(text + notes(rows) + provenance(results))
+    return "\n".join(text + notes(rows, idle_lines(main)) + provenance(results))
 
 
 def knob_lines(main: list[Row]) -> list[str]:
@@ -436,11 +437,12 @@ def convention_lines(main: list[Row]) -> list[str]:
     ]
 
 
-def notes(rows: list[Row]) -> list[str]:
-    """What a row has to say for itself."""
+def notes(rows: list[Row], idle: list[str]) -> list[str]:
+    """What a row has to say for itself; ``idle``: which rows test nothing."""
     said = [f"- `{row['method']}`: {row['note']}." for row in rows if row.get("note")]
     few = [row for row in rows if row["runs"] < max(each["runs"] for each in rows)]
     said += [f"- `{row['method']}`: {row['runs']} runs only." for row in few]
+    said += [f"- {line}." for line in idle]
     return ["## Notes", "", *said, ""] if said else []
 
 

@@ -51,9 +51,10 @@ from ..fit_cache import FitCache
 from ..options import CAPTURE, ROOT, SHORT_RESULTS, BenchmarkOptions, parse
 from ..progress import Plan, say, wrote
 from .ablation import ABLATION
-from .changes import changed_share, idle_lines
+from .changes import changed_share
 from .compact import read_expanded, write_compact
 from .figure import write_figures
+from .idle import idle_lines
 from .job import Job, Outcome, Weights
 from .methods import FACTORS_OF, METHODS, UNTRAINED, WITH_POINTS
 from .points import MATCH_SIDE, MATCH_WIDTH, digest, with_points

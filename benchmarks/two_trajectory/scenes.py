@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -241,14 +240,3 @@ def captured_scene(folder: Path, train: str, evaluation: str, *, downscale: floa
     name = f"{folder.resolve().name} {train} to {evaluation} at 1:{downscale:g}"
     known: dict[str, Any] = {"capture": capture, "taught": taught, "held_out": held_out, "split": train}
     return TrajectoryScene(name, first, second, 160, Sampling(), 4096, **known)
-
-
-def independent(name: str) -> str:
-    """What a scene is a sample of: pairs of sweeps of one capture are one capture, a synthetic scene is itself.
-
-    Example:
-        >>> independent("plush one to two at 1:8"), independent("room-0")
-        ('plush', 'room-0')
-    """
-    pair = re.fullmatch(r"(.+) \S+ to \S+ at 1:\S+", name)
-    return pair[1] if pair else name

@@ -7,11 +7,12 @@ truth. ``psnr_area`` and its like are means over all coverages from .1 up to tha
 race. Between two measured coverages a score is interpolated linearly (``evaluation/scoring/curves.py``).
 
 Means are over scenes, and intervals resample scenes; all pairs of sweeps of one capture are one scene, the mean of its
-pairs (``scenes.independent``).
+pairs (``independent``).
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -20,8 +21,6 @@ import numpy as np
 from unghost.core.metrics import get_metric
 from unghost.evaluation.scoring.curves import Curve
 from unghost.evaluation.scoring.intervals import bootstrap_scenes, defined
-
-from .scenes import independent
 
 KEYS = (
     "psnr",
@@ -166,6 +165,17 @@ def _mean(cells: Sequence[Cell], values: Sequence[float | None]) -> tuple[float 
         scenes.setdefault(cell["scene"], []).append(value)
     found = bootstrap_scenes(by_sample(scenes), np.random.default_rng(0))
     return found.mean, [found.low, found.high]
+
+
+def independent(name: str) -> str:
+    """What a scene is a sample of: pairs of sweeps of one capture are one capture, a synthetic scene is itself.
+
+    Example:
+        >>> independent("plush one to two at 1:8"), independent("room-0")
+        ('plush', 'room-0')
+    """
+    pair = re.fullmatch(r"(.+) \S+ to \S+ at 1:\S+", name)
+    return pair[1] if pair else name
 
 
 def by_sample(scenes: Mapping[str, Sequence[float | None]]) -> dict[str, list[float | None]]:

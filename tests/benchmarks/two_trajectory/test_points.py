@@ -15,8 +15,10 @@ from unghost_tests.depth_points import depth_points
 from benchmarks.fit_cache import FitCache
 from benchmarks.two_trajectory import points as module
 from benchmarks.two_trajectory import rivals, scenes
-from benchmarks.two_trajectory.changes import changed_share, idle_lines
+from benchmarks.two_trajectory.changes import changed_share
+from benchmarks.two_trajectory.idle import idle_lines
 from benchmarks.two_trajectory.job import Job, fine_tuned, sight_lines, visibility
+from benchmarks.two_trajectory.tables import independent
 from unghost.core.sparse_points import SparsePoints
 from unghost.evaluation.captures.loading import load_capture
 from unghost.fields.filtered import FilteredField
@@ -107,7 +109,7 @@ def test_of_a_capture_the_training_sweep_is_matched(capture, asked, tmp_path):
     module.with_points(part, FitCache(tmp_path / "cache"), match_side=20, fewest=1)
     assert [(indices, side) for _, indices, side, _ in asked] == [([1, 3, 4, 5, 6], 20), (part.taught.tolist(), 20)]
     assert sorted([*part.taught, *part.held_out]) == [1, 3, 4, 5, 6]
-    assert scenes.independent(scene.name) == "tiny"
+    assert independent(scene.name) == "tiny"
 
 
 def test_points_that_are_stored_for_the_sweep_are_taken(capture, asked, tmp_path, monkeypatch):

@@ -235,7 +235,7 @@ def test_every_method_runs_and_a_run_goes_on_where_it_was_broken_off(bench, stag
     trained = [row for row in done.values() if row["trained_steps"] and row["method"] != "scratch"]
     assert all(row["changed_share"] > 0 for row in trained if "@" not in row["method"])
     assert done["fitted"]["changed_share"] == done["scratch"]["changed_share"] == 0
-    with_points = {name for name, row in done.items() if "points" in row}
+    with_points = {name for name, row in done.items() if row.get("points")}
     assert with_points == set(methods.WITH_POINTS)
     points = [name for name in methods.WITH_POINTS if name.startswith("visibility+")]
     apart = {name: done[name]["psnr_visible"] for name in ("visibility", *points)}
