@@ -1,6 +1,7 @@
 """Sparse points of the training photos alone: where they come from, and what rivals make of them."""
 
 import dataclasses
+import functools
 import json
 
 import numpy as np
@@ -232,3 +233,40 @@ def test_written_captures_are_read_back(scene, tmp_path):
     capture = load_capture(tmp_path, downscale=1, normalize=False)
     assert np.allclose(capture.cameras.camera_to_world, scene.train.cameras.camera_to_world)
     assert np.abs(capture.images() - scene.train.photos).max() <= 0.5 / 255 + 1e-6
+
+
+@pytest.mark.slow
+def test_each_pair_of_a_capture_has_points_of_its_own_training_sweep(capture, asked, tmp_path, monkeypatch):
+    from benchmarks.two_trajectory import run
+
+    field = RadianceField(RadianceConfig(resolution=16, color_resolution=16, initial_opacity=0.2))
+    sweeps = []
+
+    def fitted(options, cache, stage_name, scene, sweep, seed, steps):
+        sweeps.append((stage_name, len(sweep.photos), steps))
+        return field, 1.0
+
+    monkeypatch.setattr(run, "fitted", fitted)
+    monkeypatch.setattr(run, "with_points", functools.partial(module.with_points, fewest=1))
+    options = run.Options(
+        scenes=(),
+        capture_pairs=(f"{capture}:one:two", f"{capture}:two:one"),
+        downscale=2,
+        capture_steps=(7, 1),
+        out=tmp_path,
+        cache=tmp_path / "cache",
+    )
+    stages = list(run.stages(options, FitCache(options.cache)))
+    assert [indices for _, indices, _, _ in asked] == [[1, 3, 4, 5, 6], [0, 2]]
+    assert [len(stage.scene.points.camera) for stage in stages] == [5, 2]
+    assert sweeps == [("pseudo", 7, 7)] * 2  # both sweeps stand for the truth, and nothing else learns of the second
+    assert [stage.pseudo.depth.shape for stage in stages] == [(2, 9, 12), (5, 9, 12)]
+    keys = [run.Ledger(options).key(stage, 0, method) for stage in stages for method in ("field", "scratch+all")]
+    assert ["points" in key for key in keys] == [False, True] * 2
+    assert keys[1]["factor"] == [0.03, 0.01, 0.1]
+    assert keys[1]["points"] != keys[3]["points"]
+
+    asked.clear()
+    without = dataclasses.replace(options, methods=("field", "clean"))
+    assert [stage.scene.points for stage in run.stages(without, FitCache(options.cache))] == [None, None]
+    assert asked == []  # nobody asks for points
