@@ -176,6 +176,16 @@ def _without_folders(word: str) -> str:
     return Path(word).name if "/" in word else word
 
 
+def _unturned(row: dict[str, Any]) -> str:
+    """A row's method, whatever its knob."""
+    return str(row["method"]).split(" @ ")[0]
+
+
+def _settings(row: dict[str, Any]) -> tuple[Any, Any]:
+    """What a method was run with, if that can change from one run to the next."""
+    return row.get("factor"), row.get("points")
+
+
 class Ledger:
     """Finished rows on disk; each is there whole or not at all."""
 
@@ -243,11 +253,15 @@ class Ledger:
             self.write()
 
     def add(self, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-        """Keep rows in the place of older ones of the same runs and method (any knob); as they were written."""
+        """Keep rows, in the place of those of the same run and method with other factors or points; as written."""
         ready = [json_ready({**row, "threads": self.options.threads, "commit": commit()}) for row in rows]
-        new = {(run_of(row), row["method"].split(" @ ")[0]) for row in ready}
+        known = {(run_of(row), _unturned(row)): _settings(row) for row in ready}
         with self.alone():
-            self.cells = [cell for cell in self.cells if (run_of(cell), cell["method"].split(" @ ")[0]) not in new]
+            self.cells = [
+                cell
+                for cell in self.cells
+                if known.get((run_of(cell), _unturned(cell)), _settings(cell)) == _settings(cell)
+            ]
             self.cells += ready
             self.write()
         return ready

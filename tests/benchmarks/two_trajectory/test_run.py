@@ -260,15 +260,23 @@ def test_every_method_runs_and_a_run_goes_on_where_it_was_broken_off(bench, stag
     assert len(again.cells) == len(ledger.cells)
 
 
-def test_a_row_that_is_done_again_takes_the_place_of_the_old_one(bench, tmp_path):
+def test_a_row_with_other_factors_takes_the_place_of_the_old_one(bench, tmp_path):
     main = bench["two_trajectory"]
     ledger = main.Ledger(main.Options(out=tmp_path, cache=tmp_path))
     row = {"table": "main", "scene": "a", "seed": 0, "convention": "proper", "coverage": 0.5}
-    ledger.add([{**row, "method": name, "psnr": 20.0} for name in ("clean", "clean @ 0.3", "clean @ 0.5", "field")])
-    ledger.add([{**row, "method": name, "psnr": 30.0} for name in ("clean", "clean @ 0.3")])
-    ledger.add([{**row, "method": "clean", "seed": 1, "psnr": 40.0}])
+    old = ("tv", "tv @ 0.3", "tv @ 0.5", "field")
+    ledger.add([{**row, "method": name, "psnr": 20.0, "factor": [0.1, 0.2]} for name in old])
+    ledger.add([{**row, "method": name, "psnr": 30.0, "factor": [0.1, 0.3]} for name in ("tv", "tv @ 0.3")])
+    ledger.add([{**row, "method": "tv", "seed": 1, "psnr": 40.0, "factor": [0.1, 0.3]}])
+    ledger.add([{**row, "method": "field", "psnr": 50.0, "factor": [0.1, 0.2]}])  # the same once more: both stay
     found = [(cell["method"], cell["seed"], cell["psnr"]) for cell in ledger.cells]
-    assert found == [("field", 0, 20.0), ("clean", 0, 30.0), ("clean @ 0.3", 0, 30.0), ("clean", 1, 40.0)]
+    assert sorted(found) == [
+        ("field", 0, 20.0),
+        ("field", 0, 50.0),
+        ("tv", 0, 30.0),
+        ("tv", 1, 40.0),
+        ("tv @ 0.3", 0, 30.0),
+    ]
 
 
 def test_pairs_of_sweeps(bench, tmp_path, monkeypatch, capsys):
