@@ -19,6 +19,11 @@ if TYPE_CHECKING:
     from .losses import sparsity_loss as sparsity_loss
     from .losses import squash_density as squash_density
     from .losses import total_variation_loss as total_variation_loss
+    from .point_losses import ds_nerf_loss as ds_nerf_loss
+    from .point_losses import expected_depth_loss as expected_depth_loss
+    from .point_losses import floater_score_loss as floater_score_loss
+    from .point_losses import line_of_sight_loss as line_of_sight_loss
+    from .point_losses import nearest_point_loss as nearest_point_loss
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
@@ -35,6 +40,13 @@ __getattr__, __dir__, __all__ = attach(
             "sparsity_loss",
             "squash_density",
             "total_variation_loss",
+        ],
+        ".point_losses": [
+            "ds_nerf_loss",
+            "expected_depth_loss",
+            "floater_score_loss",
+            "line_of_sight_loss",
+            "nearest_point_loss",
         ],
     },
 )

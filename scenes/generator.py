@@ -172,6 +172,24 @@ def photograph_again(rng: np.random.Generator, first: PhotographedScene, *, coun
     return PhotographedScene(first.scene, cameras, cameras, images, depth_maps, first.look)
 
 
+def photograph_larger(first: PhotographedScene, *, width: int) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """Take the photos of a sweep once more, ``width`` pixels wide and without exposure errors and noise.
+
+    Returns:
+        Images ``(N, H, W, 3)`` in [0, 1], and depth along the optical axis ``(N, H, W)``, inf for sky; for the cameras
+        ``first.true_cameras.resized(width / first.true_cameras.width)``.
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> scene = random_scene(rng)
+        >>> images, depth_maps = photograph_larger(photograph(rng, scene, count=2, width=8, height=6), width=16)
+        >>> images.shape
+        (2, 12, 16, 3)
+    """
+    colors, depth_maps = _photos(first.scene, first.true_cameras.resized(width / first.true_cameras.width), first.look)
+    return np.clip(colors, 0, 1).astype(np.float32), depth_maps
+
+
 def _photos(scene: SolidScene, cameras: Cameras, look: tuple[float, float]) -> tuple[Array, Array]:
     """Colours ``(N, H, W, 3)`` with a camera's look, and depth along the optical axis ``(N, H, W)``."""
     muted, flat = look

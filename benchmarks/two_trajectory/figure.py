@@ -56,7 +56,8 @@ def write_figures(path: Path) -> None:
                     getattr(axes.yaxis, f"set_{ticks}_formatter")("{x:g}")
     for axes in grid[-1]:
         axes.set_xlabel("coverage: share of all pixels that are scored")
-    grid[0][0].legend(fontsize=9, frameon=False)
+    if grid[0][0].get_legend_handles_labels()[0]:  # no curve begins where a barely trained field covers next to nothing
+        grid[0][0].legend(fontsize=9, frameon=False)
     scenes, runs = {name for row in rows for name in row["scenes"]}, max(row["runs"] for row in rows)
     figure.suptitle(f"Two trajectories: {len(scenes)} scenes, {runs} runs a method at most; dots: uncut", fontsize=12)
     figure.savefig(path.with_suffix(".png"), dpi=100, metadata={"Software": None})

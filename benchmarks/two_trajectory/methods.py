@@ -2,6 +2,8 @@
 
 Those that train go on from the same field with the same rays for the same steps; those that do not get the field as it
 is, which is the row ``fitted``. ``visibility+...`` are the visibility loss and one rival's, as in the paper's table.
+``WITH_POINTS`` are given the sparse points of the training photos, all the same ones. ``scratch...`` train a fresh
+field from the first step, for as many steps as the fit has; ``scratch`` alone is that fit.
 """
 
 from __future__ import annotations
@@ -20,14 +22,34 @@ from unghost.baselines.bayes_rays import LOWEST, deformation_uncertainty
 from unghost.cleaning.components import label_components
 from unghost.cleaning.keep_mask import KeepMask
 from unghost.cleaning.pipeline import Judgement, judge
-from unghost.core.lattice import lattice_axes
 from unghost.fields.filtered import FilteredField
 from unghost.regularizer.removal import RemovalLoss
 from unghost.regularizer.settings import RegularizerSettings
 
 from ..timing import Clock
-from .job import Job, Outcome, Term, add_seconds, fine_tuned, make_regularizer, visibility
-from .rivals import free_space, regnerf, sparsity, total_variation
+from .cells import cell_places
+from .job import (
+    Job,
+    Outcome,
+    Term,
+    add_seconds,
+    fine_tuned,
+    from_scratch,
+    lines_alone,
+    make_regularizer,
+    sight_lines,
+    visibility,
+)
+from .rivals import (
+    ds_nerf,
+    floater_score,
+    free_space,
+    nearest_point,
+    regnerf,
+    sparsity,
+    total_variation,
+    urban,
+)
 
 PAPER_PRIOR = Path(__file__).parents[1] / "weights" / "small-epsilon.onnx"
 PAPER_TIMESTEPS = (10, 50)
@@ -58,6 +80,32 @@ def _dsds_and_tv(job: Job) -> list[Outcome]:
 
 def _once_and_tv(job: Job) -> list[Outcome]:
     return [_doubted(fine_tuned(job, visibility, judged_once(job), total_variation(job)))]
+
+
+def _sight_lines(
+    *makers: Callable[[Job], Term], dsds: bool = False, distortion: bool = False
+) -> Callable[[Job], list[Outcome]]:
+    """Ours with sparse points, DSDS or the visibility loss alone beside them; doubted by the photos."""
+
+    def method(job: Job) -> list[Outcome]:
+        make = (lambda job: make_regularizer(job, points=True)) if dsds else sight_lines
+        config = _distorting(job) if distortion else None
+        return [_doubted(fine_tuned(job, make, *(maker(job) for maker in makers), config=config))]
+
+    return method
+
+
+def _scratch(*, lines: bool = False, seen: bool = False, distortion: bool = False) -> Callable[[Job], list[Outcome]]:
+    """From the first step: ours on sight lines, the visibility loss, the distortion loss; doubted by the photos if ours
+    takes part."""
+
+    def method(job: Job) -> list[Outcome]:
+        config = _distorting(job) if distortion else None
+        if not lines:
+            return [from_scratch(job, config=config)]
+        return [_doubted(from_scratch(job, sight_lines if seen else lines_alone, config=config))]
+
+    return method
 
 
 def judged_once(job: Job) -> Term:
@@ -141,10 +189,7 @@ def _visibility_and_bayes_rays(job: Job) -> list[Outcome]:
 def _components(job: Job) -> list[Outcome]:
     """Everything opaque that does not hang together with the largest piece goes; on the field's own grid."""
     clock = Clock()
-    box, pitch = job.base.aabb, job.base.field_pitch
-    counts = np.ceil((box[1] - box[0]) / pitch - 1e-4).astype(int)
-    axes = lattice_axes(box, pitch, tuple(counts))
-    places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).astype(np.float32)
+    box, pitch, places = job.base.aabb, job.base.field_pitch, cell_places(job.base)
     with torch.no_grad():
         density = job.base.density_fn(torch.from_numpy(places))[..., 0].numpy()
     occupied = RegularizerSettings().rule.occupied(density, pitch)
@@ -205,15 +250,49 @@ METHODS: dict[str, Callable[[Job], list[Outcome]]] = {
     "clean": lambda job: cleaned(job, job.base),
     "visibility+clean": _clean_after("visibility"),
     "dsds-restoration+clean": _clean_after("dsds-restoration"),
+    "visibility+ds-nerf": _with(ds_nerf),
+    "visibility+urban": _with(urban),
+    "visibility+nearest-point": _with(nearest_point),
+    "visibility+floater-score": _with(floater_score),
+    "visibility+sight-lines": _sight_lines(),
+    "visibility+sight-lines+distortion": _sight_lines(distortion=True),
+    "visibility+sight-lines+tv": _sight_lines(total_variation),
+    "dsds+sight-lines": _sight_lines(dsds=True),
+    "dsds+sight-lines+distortion": _sight_lines(dsds=True, distortion=True),
+    "dsds+sight-lines+tv": _sight_lines(total_variation, dsds=True),
+    # "clean+points" goes here, and its points into `judged`, as soon as `clean` takes points
+    "scratch": lambda job: [Outcome(job.base, job.fit_seconds, steps=job.fit_steps)],
+    "scratch+distortion": _scratch(distortion=True),
+    "scratch+sight-lines": _scratch(lines=True),
+    "scratch+all": _scratch(lines=True, seen=True, distortion=True),
 }
-FACTOR_OF = {
-    **{f"visibility+{name}": name for name in ("sparsity", "tv", "regnerf", "distortion")},
-    "free-space": "free_space",
-    "bayes-rays": "bayes_rays",
-    "visibility+bayes-rays": "bayes_rays",
-    "dsds-paper": "dsds_paper",
-    "dsds-restoration+distortion": "distortion",
-    "dsds-restoration+tv": "tv",
-    "dsds-once+tv": "tv",
+_LINES = ("sight_lines", "end_points")
+FACTORS_OF: dict[str, tuple[str, ...]] = {  # which weights of `Weights` a method depends on
+    **{f"visibility+{name}": (name,) for name in ("sparsity", "tv", "regnerf", "distortion", "urban")},
+    "visibility+ds-nerf": ("ds_nerf",),
+    "visibility+nearest-point": ("nearest_point",),
+    "visibility+floater-score": ("floater_score",),
+    "free-space": ("free_space",),
+    "bayes-rays": ("bayes_rays",),
+    "visibility+bayes-rays": ("bayes_rays",),
+    "dsds-paper": ("dsds_paper",),
+    "dsds-restoration+distortion": ("distortion",),
+    "dsds-restoration+tv": ("tv",),
+    "dsds-once+tv": ("tv",),
+    **{f"{name}+sight-lines": _LINES for name in ("visibility", "dsds", "scratch")},
+    **{
+        f"{name}+sight-lines+{more}": (*_LINES, more)
+        for name in ("visibility", "dsds")
+        for more in ("distortion", "tv")
+    },
+    "scratch+distortion": ("distortion",),
+    "scratch+all": (*_LINES, "distortion"),
 }
-UNTRAINED = ("fitted", "photo-doubt", "bayes-rays", "components", "clean")  # equal seconds say nothing of them
+WITH_POINTS = (
+    *(f"visibility+{name}" for name in ("ds-nerf", "urban", "nearest-point", "floater-score")),
+    *(name for name in METHODS if "sight-lines" in name),
+    "scratch+all",
+)
+FROM_SCRATCH = ("scratch", "scratch+distortion", "scratch+sight-lines", "scratch+all")
+# equal seconds say nothing of them
+UNTRAINED = ("fitted", "photo-doubt", "bayes-rays", "components", "clean", *FROM_SCRATCH)

@@ -19,7 +19,8 @@ from unghost.evaluation.scoring.intervals import Interval
 
 from .compact import read_expanded
 from .figure import write_figures
-from .tables import ORDERS, REFERENCE, finished, format_rows, main_rows, per_scene, summary_rows
+from .idle import idle_lines
+from .tables import ORDERS, REFERENCE, finished, format_rows, main_rows, per_sample, per_scene, summary_rows
 
 ROOT = Path(__file__).resolve().parents[2]
 OURS = (
@@ -32,6 +33,9 @@ OURS = (
     "clean",
     "visibility+clean",
     "dsds-restoration+clean",
+    *(f"{name}+sight-lines{more}" for name in ("visibility", "dsds") for more in ("", "+distortion", "+tv")),
+    "scratch+sight-lines",
+    "scratch+all",
 )
 NOTHING_OF_OURS = "photo-doubt"  # but the order of pixels: where all have the same, it is the field as it was fitted
 WATCHED = ("dsds-restoration", "clean")
@@ -52,7 +56,22 @@ ROWS = {
     "dsds-once": "ours: the prior judges the field once, as for `clean`, and what it would take out is held down while "
     "the field trains on (`RemovalLoss`): the photos may object",
     "clean": "ours: `unghost.clean` on `fitted`, or after another method (`…+clean`)",
+    "visibility+ds-nerf": "DS-NeRF's depth supervision by the sparse points of the training photos, deviations from "
+    "their triangulation",
+    "visibility+urban": "the expected-depth and line-of-sight losses of Urban Radiance Fields, on the same points",
+    "visibility+nearest-point": "density costs in proportion to the distance to the nearest of the same points, up to "
+    "a tenth of the median distance from a camera to a point",
+    "visibility+floater-score": "density costs by a hand-made score: sight lines through / (through + 3 ending) × "
+    "distance to the five nearest points, up to the same length × (1 − opacity beside it)",
+    "visibility+sight-lines": "ours, without the prior: density costs on sight lines between cameras and the points",
+    "dsds+sight-lines": "ours: score distillation, the visibility loss and sight lines, all at their defaults",
+    "scratch": "not fine-tuned: the fit itself, by the photos alone, with its seconds",
+    "scratch+distortion": "a fit with the distortion loss from the first step on, for as many steps",
+    "scratch+sight-lines": "ours: a fit with sight lines from the first step on",
+    "scratch+all": "ours: a fit with distortion, visibility and sight lines from the first step on",
 }
+PER_SCENE = ("psnr_at_coverage", "psnr", "disparity_mae_at_coverage", "coverage", "floater_recall", "surface_kept")
+SCENES_PAGE = "two_trajectory_scenes.md"
 PLAIN = (
     "psnr_at_coverage",
     "psnr_area",
@@ -127,7 +146,9 @@ def difference(cells: list[Row], ours: str, rival: str, key: str, sign: int) -> 
     """How much better ours is, over the scenes' means; Student's t, as a bootstrap of so few scenes is too sure."""
     found = per_scene(cells, (ours, rival), key)
     common = [name for name in found[ours] if name in found[rival]]
-    values = np.array([sign * (found[ours][name] - found[rival][name]) for name in common])
+    values = np.array(
+        [*per_sample({name: sign * (found[ours][name] - found[rival][name]) for name in common}).values()]
+    )
     if len(values) < 2:
         return Interval(float(values.mean()) if len(values) else None, None, None, 0.95, len(values), 0)
     mean, half = float(values.mean()), float(sem(values) * t.ppf(0.975, len(values) - 1))
@@ -157,7 +178,8 @@ def page(results: dict[str, Any], folder: Path) -> str:
         f"A field is fitted to one sweep of photos and scored on another: {len(scenes)} scenes "
         f"({', '.join(scenes)}); all that trains does so for equally many steps. Synthetic scenes have exact depth, "
         "normals and visibility, and of most places in them it is known whether they are surface or air; of a capture "
-        "nothing is known but the photos, and a field fitted to both sweeps stands for the rest, as in the paper. The "
+        "nothing is known but the photos, and a field fitted to both sweeps stands for the rest, as in the paper; "
+        f"pairs of sweeps of one capture count as one scene. [Scene by scene]({SCENES_PAGE}). The "
         "scores' convention is `proper` ([what that is](../evaluation.md)); means are over scenes, of each scene over "
         "its seeds.",
         "",
@@ -287,7 +309,7 @@ def page(results: dict[str, Any], folder: Path) -> str:
                 ),
                 "",
             ]
-    return "\n".join(text + notes(rows) + provenance(results))
+    return "\n".join(text + notes(rows, idle_lines(main)) + provenance(results))
 
 
 def knob_lines(main: list[Row]) -> list[str]:
@@ -335,12 +357,14 @@ def scene_lines(results: dict[str, Any], main: list[Row]) -> list[str]:
     known = results.get("scenes", {}).get("main", {})
     seeds = {name: sorted({cell["seed"] for cell in main if cell["scene"] == name}) for name in known}
     head = ["scene", "seeds", "photos to train on", "scored", "to the nearest photo", "turned by", "pixels that it saw"]
+    head.append("sparse points")
     lines = [f"| {' | '.join(head)} |", "| --- |" + " --- |" * (len(head) - 1)]
     for name in (name for name in sorted(known) if seeds[name]):
         each = known[name]
         lines.append(
             f"| {name} | {', '.join(map(str, seeds[name]))} | {each['train_photos']} | {each['photos']} | "
-            f"{each['translation_to_nearest']:.2f} | {each['rotation_to_nearest_deg']:.0f}° | {each['visible']:.2f} |"
+            f"{each['translation_to_nearest']:.2f} | {each['rotation_to_nearest_deg']:.0f}° | {each['visible']:.2f} | "
+            f"{each.get('points', '–')} |"
         )
     if len(lines) == 2:
         return []
@@ -351,6 +375,33 @@ def scene_lines(results: dict[str, Any], main: list[Row]) -> list[str]:
         "",
         "Means over the scored photos; all cameras in [-1, 1] (the paper's 0.62, 28.5°; MipNeRF-360 0.07, 10.5°).",
     ]
+
+
+def scenes_page(results: dict[str, Any]) -> str:
+    """Every method's scores on every scene, as the paper's supplement has them."""
+    cells = [cell for cell in finished(results["cells"]) if cell["table"] == "main"]
+    scenes = sorted({cell["scene"] for cell in cells})
+    names = [row["method"] for row in main_rows(results, "main")]
+    text = [
+        "# Who takes ghosts out, scene by scene",
+        "",
+        "Written by `python -m benchmarks.two_trajectory.page`; means over the seeds of each scene. What the rows and "
+        "columns are is said [with the means over all scenes](README.md).",
+        "",
+    ]
+    for key in PER_SCENE:
+        metric, found = get_metric(key), per_scene(results["cells"], names, key)
+        shown = [scene for scene in scenes if any(scene in each for each in found.values())]
+        if not shown:
+            continue
+        text += [f"## {metric.name[0].upper()}{metric.name[1:]}", "", f"| method | {' | '.join(shown)} |"]
+        text += ["| --- |" + " --- |" * len(shown)]
+        for name in names:
+            values = [found[name].get(scene) for scene in shown]
+            line = ["–" if value is None else f"{value:.{metric.decimals}f}" for value in values]
+            text.append(f"| {name} | {' | '.join(line)} |")
+        text.append("")
+    return "\n".join(text)
 
 
 def convention_lines(main: list[Row]) -> list[str]:
@@ -386,11 +437,12 @@ def convention_lines(main: list[Row]) -> list[str]:
     ]
 
 
-def notes(rows: list[Row]) -> list[str]:
-    """What a row has to say for itself."""
+def notes(rows: list[Row], idle: list[str]) -> list[str]:
+    """What a row has to say for itself; ``idle``: which rows test nothing."""
     said = [f"- `{row['method']}`: {row['note']}." for row in rows if row.get("note")]
     few = [row for row in rows if row["runs"] < max(each["runs"] for each in rows)]
     said += [f"- `{row['method']}`: {row['runs']} runs only." for row in few]
+    said += [f"- {line}." for line in idle]
     return ["## Notes", "", *said, ""] if said else []
 
 
@@ -398,6 +450,7 @@ def main() -> None:
     path = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "docs" / "results" / "two_trajectory.json"
     results = read_expanded(path)
     path.with_name("README.md").write_text(page(results, path.parent), encoding="utf-8")
+    path.with_name(SCENES_PAGE).write_text(scenes_page(results), encoding="utf-8")
     write_figures(path)
 
 

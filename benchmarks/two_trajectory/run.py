@@ -1,27 +1,37 @@
 """The two-trajectory benchmark: who takes ghosts out, at equal coverage, on scenes of which everything is known?
 
-    python -m benchmarks.two_trajectory.run --capture CAPTURE      the whole: a night on two cores
+    python -m benchmarks.two_trajectory.run --seeds 0              twelve synthetic scenes: a night on two cores
+    python -m benchmarks.two_trajectory.run --scenes --capture-pairs plush:one:two plush:two:one     captures alone
     python -m benchmarks.two_trajectory.run --short                one small scene, few steps: some minutes, out/short
     python -m benchmarks.two_trajectory.run --scenes room-0 --methods field visibility
+    python -m benchmarks.two_trajectory.run --prepare              scenes and their sparse points, nothing trained
 
 A field is fitted to one sweep of photos, every method improves it (``methods.py``) for the same steps, and
 each is scored on another sweep under the convention ``proper``, at its own coverage and cut to others, in several
 orders of pixels (``scores.py``). Every finished row is saved at once in
 ``docs/results/two_trajectory.json``, in the form of ``compact.py``; what is there is not done again, so that a run that
 was broken off goes on with the same command, and several processes may share the file, each with other scenes or seeds
-(with ``--threads 1``: means of seconds are over rows with the most threads). Knobs and the field of both sweeps are
+(with ``--threads 1``: means of seconds are over rows with the most threads). A row that is done again, because a factor
+or the sparse points have changed, takes the place of the old one. A run in which a method of the table is missing, such
+as a seed from before that method was added, counts for no mean. Knobs and the field of both sweeps are
 looked at on seed 0 of the synthetic scenes alone.
 ``--equal-seconds`` trains for as long as ``visibility`` took (the median of the main table), ``--ablation`` does the
 paper's ablation, ``--every-eighth`` scores every 8th photo of the first sweep. The page: ``page.py``.
+
+A method must do something: a row says what share of the field it changed and which of its losses were 0 at every step.
+Where a method that trains changed nothing or had such a loss, or another one changed nothing on any scene, the run says
+so and ends with status 1.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -30,6 +40,7 @@ import torch
 from filelock import FileLock
 from numpy.typing import NDArray
 
+from unghost.core.cameras import Cameras
 from unghost.core.results import build_results, commit, json_ready
 from unghost.evaluation.captures.difficulty import difficulty_rows
 from unghost.fields.radiance import RadianceConfig, RadianceField
@@ -40,15 +51,21 @@ from ..fit_cache import FitCache
 from ..options import CAPTURE, ROOT, SHORT_RESULTS, BenchmarkOptions, parse
 from ..progress import Plan, say, wrote
 from .ablation import ABLATION
+from .changes import changed_share
 from .compact import read_expanded, write_compact
 from .figure import write_figures
+from .idle import idle_lines
 from .job import Job, Outcome, Weights
-from .methods import FACTOR_OF, METHODS, UNTRAINED
+from .methods import FACTORS_OF, METHODS, UNTRAINED, WITH_POINTS
+from .points import MATCH_SIDE, MATCH_WIDTH, digest, with_points
 from .scenes import LabelledSpace, Sweep, TrajectoryScene, captured_scene, synthetic_scene
 from .scores import CONVENTION, Stage, scored
-from .tables import FEWER_SEEDS, REFERENCE, summary_rows
+from .tables import FEWER_SEEDS, REFERENCE, run_of, summary_rows
 
-SCENES = ("room-0", "room-1", "room-2", "room-5", "objects-4", "objects-27")
+SCENES = (  # the first of each kind with two free paths, enough of what the first saw in the second, and enough points
+    *(f"room-{number}" for number in (0, 1, 2, 5, 10, 11, 12, 15, 18)),
+    *(f"objects-{number}" for number in (4, 27, 42)),
+)
 
 
 @dataclass(frozen=True)
@@ -60,7 +77,8 @@ class Options(BenchmarkOptions):
         scene_seed: of the synthetic scenes; they were used for nothing else (the methods' settings are of 555).
         capture: a real one too.
         train, eval: its sweeps.
-        downscale: its photo pixels per rendered pixel.
+        capture_pairs: more of them, as FOLDER:TRAIN:EVAL each; pairs of one capture count as one in means.
+        downscale: their photo pixels per rendered pixel.
         methods: of the table; all if left out. ``pseudo-gt`` is the field trained on both sweeps.
         seeds: of fits, rays and cubes.
         fit_steps: of the fit.
@@ -72,12 +90,18 @@ class Options(BenchmarkOptions):
         photos, views: of the training and of the evaluation sweep of a synthetic scene.
         width: of its photos, 4 : 3.
         resolution: of the grid that is fitted to it.
-        cache: where fitted fields are kept.
+        match_width, match_side: of the photos in which features are looked for: width of a synthetic scene's, longest
+            side of a capture's.
+        prepare: make the scenes and their sparse points, say how many there are, and train nothing.
+        pictures: draw the methods of ``pictures.py`` at the end, of the first synthetic scene and of the first pair.
+        cache: where fitted fields and sparse points are kept.
     """
 
     SHORT: ClassVar[dict[str, Any]] = {
         "scenes": ("room-1",),
         "seeds": (0,),
+        "match_width": 192,
+        "match_side": 800,
         "fit_steps": 40,
         "steps": 2,
         "capture_steps": (10, 2),
@@ -95,6 +119,7 @@ class Options(BenchmarkOptions):
     capture: Path | None = None
     train: str = "trajectory_1"
     eval: str = "trajectory_3"
+    capture_pairs: tuple[str, ...] = ()
     downscale: float = 8
     methods: tuple[str, ...] = (REFERENCE, *METHODS)
     seeds: tuple[int, ...] = (0, 1, 2)
@@ -108,7 +133,26 @@ class Options(BenchmarkOptions):
     views: int = 10
     width: int = 96
     resolution: int = 96
+    match_width: int = MATCH_WIDTH
+    match_side: int = MATCH_SIDE
+    prepare: bool = False
+    pictures: bool = False
     cache: Path = ROOT / "out" / "two_trajectory"
+
+    def pairs(self) -> list[tuple[Path, str, str]]:
+        """Captures with the sweep to train on and the one that is scored, each once."""
+        found = [] if self.capture is None else [(self.capture, self.train, self.eval)]
+        for text in self.capture_pairs:
+            folder, *sweeps = text.rsplit(":", 2)
+            if len(sweeps) != 2 or not all((folder, *sweeps)):
+                raise ValueError(f"--capture-pairs: must be FOLDER:TRAIN:EVAL each, got {text}")
+            found.append((Path(folder), sweeps[0], sweeps[1]))
+        return list(dict.fromkeys(found))
+
+    def lacking(self) -> str | None:
+        """Captures that are not there, too."""
+        missing = [folder for folder, _, _ in self.pairs() if not folder.exists()]
+        return super().lacking() or (f"capture_pairs: there is no {missing[0]}; needs {CAPTURE}" if missing else None)
 
     def names(self, seed: int = 0) -> tuple[str, ...]:
         """Methods of the table; those that do not train have nothing to do with equal seconds."""
@@ -130,6 +174,16 @@ class Options(BenchmarkOptions):
 def _without_folders(word: str) -> str:
     """A word of the command line without anybody's folders."""
     return Path(word).name if "/" in word else word
+
+
+def _unturned(row: dict[str, Any]) -> str:
+    """A row's method, whatever its knob."""
+    return str(row["method"]).split(" @ ")[0]
+
+
+def _settings(row: dict[str, Any]) -> tuple[Any, Any]:
+    """What a method was run with, if that can change from one run to the next."""
+    return row.get("factor"), row.get("points")
 
 
 class Ledger:
@@ -158,10 +212,13 @@ class Ledger:
     def key(self, stage: Stage, seed: int, method: str) -> dict[str, Any]:
         """What a row is known by."""
         named = {"table": self.options.table(), "scene": stage.scene.name, "seed": seed, "method": method}
-        swept = FACTOR_OF.get("dsds-paper" if method.startswith("paper, ") else method)
+        swept = FACTORS_OF.get("dsds-paper" if method.startswith("paper, ") else method, ())
+        factors = [getattr(Weights(), name) for name in swept]
+        points = stage.scene.points if method in WITH_POINTS else None
         return {
             **named,
-            "factor": getattr(Weights(), swept) if swept else None,
+            "factor": factors[0] if len(factors) == 1 else factors or None,
+            **({} if points is None else {"points": digest(points)}),
             "steps": stage.steps,
             "fit_steps": stage.fit_steps,
             "scene_seed": self.options.scene_seed,
@@ -190,14 +247,21 @@ class Ledger:
         """How hard a scene is, and how much of its evaluation views was seen."""
         hard, *_ = difficulty_rows(stage.scene.train.cameras, stage.scene.evaluation.cameras)
         hard |= {"visible": float(stage.pseudo.visible(occlusion=True).mean()), "depth_limit": stage.scene.extent.limit}
+        hard |= {} if stage.scene.points is None else {"points": len(stage.scene.points)}
         with self.alone():
             self.scenes.setdefault(self.options.table(), {})[stage.scene.name] = hard
             self.write()
 
     def add(self, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-        """Keep rows; as they were written."""
+        """Keep rows, in the place of those of the same run and method with other factors or points; as written."""
         ready = [json_ready({**row, "threads": self.options.threads, "commit": commit()}) for row in rows]
+        known = {(run_of(row), _unturned(row)): _settings(row) for row in ready}
         with self.alone():
+            self.cells = [
+                cell
+                for cell in self.cells
+                if known.get((run_of(cell), _unturned(cell)), _settings(cell)) == _settings(cell)
+            ]
             self.cells += ready
             self.write()
         return ready
@@ -235,8 +299,16 @@ def fitted(
     return field, record["seconds"]
 
 
-def stages(options: Options, cache: FitCache) -> Iterator[Stage]:
-    """The scenes, one after the other; a capture's truth is that of a field trained on both sweeps."""
+def prepared(options: Options, cache: FitCache, scene: TrajectoryScene) -> TrajectoryScene:
+    """The scene as it is trained and scored on, with sparse points if a method needs them."""
+    scene = scene.every_nth() if options.every_eighth else scene
+    if not (options.prepare or set(options.names()) & set(WITH_POINTS)):
+        return scene
+    return with_points(scene, cache, match_width=options.match_width, match_side=options.match_side)
+
+
+def synthetic_scenes(options: Options, cache: FitCache) -> Iterator[TrajectoryScene]:
+    """Those of the options, one after the other."""
     for name in options.scenes:
         scene = synthetic_scene(
             options.scene_seed,
@@ -246,29 +318,40 @@ def stages(options: Options, cache: FitCache) -> Iterator[Stage]:
             width=options.width,
             resolution=options.resolution,
         )
-        scene = scene.every_nth() if options.every_eighth else scene
+        yield prepared(options, cache, scene)
+
+
+def stages(options: Options, cache: FitCache) -> Iterator[Stage]:
+    """The scenes, one after the other; a capture's truth is that of a field trained on both sweeps."""
+    for scene in synthetic_scenes(options, cache):
         pseudo = scene.pseudo(lambda cameras: np.zeros(0))
         yield Stage(scene, pseudo, scene.truth(pseudo), options.fit_steps, options.steps)
-    if options.capture is not None:
-        scene = captured_scene(options.capture, options.train, options.eval, downscale=options.downscale)
+    for folder, train, evaluation in options.pairs():
+        whole = captured_scene(folder, train, evaluation, downscale=options.downscale)
+        scene = prepared(options, cache, whole)
         fit_steps, steps = options.capture_steps
-        field, _ = fitted(options, cache, "pseudo", scene, scene.train.joined(scene.evaluation), 0, fit_steps)
-
-        def depth_of(cameras: Any) -> NDArray[Any]:
-            return np.stack([render_view(field, cameras, index)["depth"] for index in range(len(cameras))])
-
-        scene = scene.every_nth() if options.every_eighth else scene
+        field, _ = fitted(options, cache, "pseudo", whole, whole.train.joined(whole.evaluation), 0, fit_steps)
+        depth_of = partial(depths_of, field)
         pseudo = scene.pseudo(depth_of)
-        yield Stage(scene, pseudo, scene.truth(pseudo), fit_steps, steps)
+        yield Stage(scene, pseudo, scene.truth(pseudo), fit_steps, steps, depth_of)
 
 
-def rows_of(key: dict[str, Any], stage: Stage, outcomes: list[Outcome], space: LabelledSpace | None) -> Any:
+def depths_of(field: RadianceField, cameras: Cameras) -> NDArray[Any]:
+    """Along unit rays, ``(n, H, W)``."""
+    return np.stack([render_view(field, cameras, index)["depth"] for index in range(len(cameras))])
+
+
+def rows_of(
+    key: dict[str, Any], stage: Stage, outcomes: list[Outcome], space: LabelledSpace | None, base: Any
+) -> list[dict[str, Any]]:
     """A row for the method, and one for every other setting of its knob, named ``method @ knob``."""
     rows = []
     for number, outcome in enumerate(outcomes):
         name = key["method"] if number == 0 else f"{key['method']} @ {outcome.knob:g}"
         found = scored(stage, outcome, space, conventions=name == "field", headline=number == 0)
-        rows.append({**key, "method": name, **found})
+        did: dict[str, Any] = {"changed_share": changed_share(outcome.field, base)} if number == 0 else {}
+        did |= {"idle": list(outcome.idle)} if outcome.idle else {}
+        rows.append({**key, "method": name, **found, **did})
     return rows
 
 
@@ -287,9 +370,9 @@ def run_stage(options: Options, stage: Stage, cache: FitCache, ledger: Ledger, p
             if ledger.has(keys[name]):
                 continue
             if job is None:
-                base, _ = fitted(options, cache, "field", scene, scene.train, seed, stage.fit_steps)
+                base, took = fitted(options, cache, "field", scene, scene.train, seed, stage.fit_steps)
                 budget = ledger.seconds_of(scene.name, "visibility") if options.equal_seconds else None
-                job = Job(scene, base, seed, stage.steps, budget, threads=options.threads)
+                job = Job(scene, base, seed, stage.steps, budget, stage.fit_steps, took, threads=options.threads)
                 space = LabelledSpace(scene, base, seed) if scene.photographed is not None else None
             if name == REFERENCE:
                 both = scene.train.joined(scene.evaluation)
@@ -299,7 +382,7 @@ def run_stage(options: Options, stage: Stage, cache: FitCache, ledger: Ledger, p
                 outcomes = table[name](job)
             if seed > 0 or scene.photographed is None:
                 outcomes = outcomes[:1]
-            last, *_ = ledger.add(rows_of(keys[name], stage, outcomes, space))
+            last, *_ = ledger.add(rows_of(keys[name], stage, outcomes, space, job.base))
             say(
                 "    "
                 + " ".join(
@@ -317,7 +400,10 @@ def main() -> None:
     if options.short and options.out == SHORT_RESULTS:  # does its work anew
         ledger.path.unlink(missing_ok=True)
         ledger.read()
-    count = len(options.scenes) + (options.capture is not None)
+    if options.prepare:
+        prepare(options, cache)
+        return
+    count = len(options.scenes) + len(options.pairs())
     names = [name for seed in options.seeds for name in options.names(seed)]
     plan = Plan(names * count, dict.fromkeys(names, 40.0))
     begun = time.perf_counter()
@@ -326,6 +412,30 @@ def main() -> None:
     write_figures(ledger.path)
     say(f"{(time.perf_counter() - begun) / 60:.1f} min")
     wrote(ledger.path, ledger.path.with_suffix(".png"))
+    if options.pictures:
+        from .pictures import draw_all
+
+        draw_all(options, cache)
+    idle = idle_lines(cell for cell in ledger.cells if cell["table"] == options.table())
+    for line in idle:
+        say(line)
+    if idle and not options.short:  # in a few steps some losses have nothing to do
+        sys.exit(1)
+
+
+def prepare(options: Options, cache: FitCache) -> None:
+    """Scenes and points into the cache; whoever cannot be used is named, and the others go on."""
+    unusable = 0
+    for name in options.scenes:
+        try:
+            list(synthetic_scenes(dataclasses.replace(options, scenes=(name,)), cache))
+        except ValueError as error:
+            unusable += 1
+            say(f"    {error}")
+    for folder, train, evaluation in options.pairs():
+        prepared(options, cache, captured_scene(folder, train, evaluation, downscale=options.downscale))
+    if unusable:
+        sys.exit(1)
 
 
 if __name__ == "__main__":

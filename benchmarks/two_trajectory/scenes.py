@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from unghost.core.cameras import Cameras
 from unghost.core.occupancy import FREE_LABEL, SURFACE_LABEL, OccupancyRule, opacity_from_density
+from unghost.core.sparse_points import SparsePoints
 from unghost.data_recipes.harvest.labels import Truth as Labels
 from unghost.evaluation.captures.difficulty import every_nth
-from unghost.evaluation.captures.loading import load_capture
+from unghost.evaluation.captures.loading import Capture, load_capture
 from unghost.evaluation.scoring.conventions import SceneExtent
 from unghost.evaluation.scoring.depths import ray_depth
 from unghost.evaluation.scoring.pseudo_truth import PseudoTruth, make_pseudo_truth
@@ -65,6 +66,11 @@ class TrajectoryScene:
         sampling: along its rays.
         rays: of a training step.
         photographed, again: what is known of a synthetic scene; None for a capture.
+        points: sparse points of the training photos alone, in the frame of ``train.cameras``, whose positions their
+            observations use; None as long as nobody asked for them (``points.py``).
+        capture, taught, held_out: a capture, and the positions of its training and its evaluation photos in it; None
+            for a synthetic scene.
+        split: the capture's name of the training sweep; empty where only some of its photos are trained on.
     """
 
     name: str
@@ -75,6 +81,11 @@ class TrajectoryScene:
     rays: int
     photographed: PhotographedScene | None = None
     again: PhotographedScene | None = None
+    points: SparsePoints | None = None
+    capture: Capture | None = None
+    taught: NDArray[np.int64] | None = None
+    held_out: NDArray[np.int64] | None = None
+    split: str = ""
 
     @property
     def extent(self) -> SceneExtent:
@@ -82,12 +93,25 @@ class TrajectoryScene:
         return SceneExtent.of(self.train.cameras, self.evaluation.cameras)
 
     def every_nth(self, n: int = 8) -> TrajectoryScene:
-        """What most papers score: every n-th photo of the training sweep, which then does not train."""
+        """What most papers score: every n-th photo of the training sweep, which then does not train.
+
+        The points go: those of the photos that are left are triangulated anew.
+        """
         taught, held_out = every_nth(len(self.train.photos), n=n)
         parts = [Sweep(self.train.cameras.select(chosen), self.train.photos[chosen]) for chosen in (taught, held_out)]
         first = self.photographed
         known = [None, None] if first is None else [_selected(first, chosen) for chosen in (taught, held_out)]
-        return dataclasses.replace(self, train=parts[0], evaluation=parts[1], photographed=known[0], again=known[1])
+        return dataclasses.replace(
+            self,
+            train=parts[0],
+            evaluation=parts[1],
+            photographed=known[0],
+            again=known[1],
+            points=None,
+            taught=None if self.taught is None else self.taught[taught],
+            held_out=None if self.taught is None else self.taught[held_out],
+            split="",
+        )
 
     def pseudo(self, depth_of: DepthOf) -> PseudoTruth:
         """Maps of the evaluation views: exact where everything is known, else by ``depth_of`` (along unit rays)."""
@@ -209,11 +233,10 @@ def synthetic_scene(
 def captured_scene(folder: Path, train: str, evaluation: str, *, downscale: float) -> TrajectoryScene:
     """A real capture."""
     capture = load_capture(folder, downscale=downscale)
-    first, second = (
-        Sweep(capture.cameras.select(chosen), capture.images(chosen))
-        for chosen in (capture.split(train), capture.split(evaluation))
-    )
-    if set(capture.split(train)) & set(capture.split(evaluation)):
+    taught, held_out = capture.split(train), capture.split(evaluation)
+    if set(taught.tolist()) & set(held_out.tolist()):
         raise ValueError(f"{train} and {evaluation} share photos")
+    first, second = (Sweep(capture.cameras.select(chosen), capture.images(chosen)) for chosen in (taught, held_out))
     name = f"{folder.resolve().name} {train} to {evaluation} at 1:{downscale:g}"
-    return TrajectoryScene(name, first, second, 160, Sampling(), 4096)
+    known: dict[str, Any] = {"capture": capture, "taught": taught, "held_out": held_out, "split": train}
+    return TrajectoryScene(name, first, second, 160, Sampling(), 4096, **known)

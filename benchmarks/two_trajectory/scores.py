@@ -25,7 +25,7 @@ from unghost.evaluation.uncertainty.sparsification import sparsify
 
 from ..timing import Clock, Spent
 from .job import Outcome, Views, add_seconds, render
-from .scenes import LabelledSpace, TrajectoryScene
+from .scenes import DepthOf, LabelledSpace, TrajectoryScene
 
 CONVENTION = "proper"
 COVERAGES = (0.02, 0.05, *(round(0.05 * step, 2) for step in range(2, 20)))
@@ -37,13 +37,14 @@ DIGITS = 4  # of a curve's numbers
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """One scene with the truth about it."""
+    """One scene with the truth about it; ``depth_of``: of a capture, what stands for its depth, from any camera."""
 
     scene: TrajectoryScene
     pseudo: PseudoTruth
     truth: Truth
     fit_steps: int
     steps: int
+    depth_of: DepthOf | None = None
 
 
 def scored(

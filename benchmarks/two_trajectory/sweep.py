@@ -1,6 +1,7 @@
-"""How much should each rival's loss weigh? Every factor on development scenes, none of which the benchmark scores.
+"""How much should each loss weigh? Every factor on development scenes, none of which the benchmark scores.
 
     python -m benchmarks.two_trajectory.sweep
+    python -m benchmarks.two_trajectory.sweep --losses sight_lines end_points ds_nerf urban nearest_point floater_score
     python -m benchmarks.two_trajectory.sweep --losses       tries nothing: chooses anew among what is there
 
 All factors of a loss are cut to the lowest coverage among them; of those whose PSNR is there within .1 dB of the best,
@@ -29,7 +30,8 @@ from ..options import ROOT, SHORT_RESULTS, BenchmarkOptions, parse
 from ..progress import Plan, say, wrote
 from .compact import compact_rows
 from .job import Job, Weights
-from .methods import FACTOR_OF, METHODS
+from .methods import FACTORS_OF, METHODS
+from .points import MATCH_WIDTH, with_points
 from .run import Options as Benchmark
 from .run import fitted
 from .scenes import synthetic_scene
@@ -44,7 +46,15 @@ FACTORS = {
     "free_space": (1e-6, 1e-5, 1e-4, 1e-3),
     "bayes_rays": (0.6, 0.7, 0.8, 0.9),
     "dsds_paper": (1e-2, 1e-1, 1.0, 10.0),
+    "sight_lines": (1e-2, 3e-2, 1e-1, 3e-1),  # ours; the library's default should be what is chosen here
+    "end_points": (0.0, 3e-3, 1e-2, 3e-2),
+    "ds_nerf": (1e-2, 1e-1, 1.0, 10.0),
+    "urban": (1e-4, 1e-3, 1e-2, 1e-1),
+    "nearest_point": (1e-3, 1e-2, 1e-1, 1.0),
+    "floater_score": (1e-2, 1e-1, 1.0, 10.0),
 }
+OURS = ("sight_lines", "end_points")
+POINT_LOSSES = (*OURS, "ds_nerf", "urban", "nearest_point", "floater_score")
 WITHIN_DB = 0.1
 
 
@@ -58,7 +68,7 @@ class Options(BenchmarkOptions):
         losses: whose factors; all if left out.
         factors: tried of each loss, at most.
         fit_steps, steps: as in the benchmark.
-        photos, views, width, resolution: of a scene, as in the benchmark.
+        photos, views, width, resolution, match_width: of a scene, as in the benchmark.
         cache: where fitted fields are kept.
     """
 
@@ -71,6 +81,7 @@ class Options(BenchmarkOptions):
         "views": 3,
         "width": 48,
         "resolution": 48,
+        "match_width": 192,
         "cache": SHORT_RESULTS / "two_trajectory",
     }
 
@@ -84,6 +95,7 @@ class Options(BenchmarkOptions):
     views: int = 10
     width: int = 96
     resolution: int = 96
+    match_width: int = MATCH_WIDTH
     cache: Path = ROOT / "out" / "two_trajectory"
 
 
@@ -108,6 +120,11 @@ def chosen_factors(rows: list[dict[str, Any]]) -> dict[str, str]:
     return result
 
 
+def swept_by(loss: str) -> str:
+    """The method by which a factor is chosen: the first that depends on it (and on few others)."""
+    return next(name for name, factors in FACTORS_OF.items() if loss in factors)
+
+
 def main() -> None:
     options = parse(Options, __doc__)
     torch.set_num_threads(options.threads)
@@ -123,11 +140,13 @@ def main() -> None:
             width=options.width,
             resolution=options.resolution,
         )
+        if set(options.losses) & set(POINT_LOSSES):
+            scene = with_points(scene, cache, match_width=options.match_width)
         pseudo = scene.pseudo(lambda cameras: np.zeros(0))
         stage = Stage(scene, pseudo, scene.truth(pseudo), options.fit_steps, options.steps)
         base, _ = fitted(Benchmark(), cache, "field", scene, scene.train, 0, options.fit_steps)
         for loss in options.losses:
-            method = METHODS[next(name for name, factor in FACTOR_OF.items() if factor == loss)]
+            method = METHODS[swept_by(loss)]
             for factor in FACTORS[loss][: options.factors]:
                 plan.begin(loss, f"{name}, {loss} {factor:g}")
                 weights = dataclasses.replace(Weights(), **{loss: factor})

@@ -5,18 +5,22 @@ coverage among them, each at its own setting and in its own order of pixels; ``_
 that order; ``_at_best``: the setting of its knob and the order that are best for it there, which takes an eye on the
 truth. ``psnr_area`` and its like are means over all coverages from .1 up to that bar: one coverage is a moment of the
 race. Between two measured coverages a score is interpolated linearly (``evaluation/scoring/curves.py``).
+
+Means are over scenes, and intervals resample scenes; all pairs of sweeps of one capture are one scene, the mean of its
+pairs (``independent``).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from unghost.core.metrics import get_metric
 from unghost.evaluation.scoring.curves import Curve
-from unghost.evaluation.scoring.intervals import bootstrap_scenes
+from unghost.evaluation.scoring.intervals import bootstrap_scenes, defined
 
 KEYS = (
     "psnr",
@@ -70,6 +74,20 @@ COLORS = {  # in the order of the tables
     "clean": "#ff7f0e",
     "visibility+clean": "#ffbb78",
     "dsds-restoration+clean": "#ff9896",
+    "visibility+ds-nerf": "#b2df8a",
+    "visibility+urban": "#33a02c",
+    "visibility+nearest-point": "#a6761d",
+    "visibility+floater-score": "#e6ab02",
+    "visibility+sight-lines": "#cab2d6",
+    "visibility+sight-lines+distortion": "#7570b3",
+    "visibility+sight-lines+tv": "#e7298a",
+    "dsds+sight-lines": "#d95f02",
+    "dsds+sight-lines+distortion": "#a50026",
+    "dsds+sight-lines+tv": "#f46d43",
+    "scratch": "#666666",
+    "scratch+distortion": "#80b1d3",
+    "scratch+sight-lines": "#fb8072",
+    "scratch+all": "#bf5b17",
 }
 Cell = dict[str, Any]
 
@@ -145,8 +163,40 @@ def _mean(cells: Sequence[Cell], values: Sequence[float | None]) -> tuple[float 
     scenes: dict[str, list[float | None]] = {}
     for cell, value in zip(cells, values):
         scenes.setdefault(cell["scene"], []).append(value)
-    found = bootstrap_scenes(scenes, np.random.default_rng(0))
+    found = bootstrap_scenes(by_sample(scenes), np.random.default_rng(0))
     return found.mean, [found.low, found.high]
+
+
+def independent(name: str) -> str:
+    """What a scene is a sample of: pairs of sweeps of one capture are one capture, a synthetic scene is itself.
+
+    Example:
+        >>> independent("plush one to two at 1:8"), independent("room-0")
+        ('plush', 'room-0')
+    """
+    pair = re.fullmatch(r"(.+) \S+ to \S+ at 1:\S+", name)
+    return pair[1] if pair else name
+
+
+def by_sample(scenes: Mapping[str, Sequence[float | None]]) -> dict[str, list[float | None]]:
+    """Scene -> values over seeds, with a capture in the place of its pairs of sweeps: its values are the pairs' means.
+
+    Example:
+        >>> by_sample({"room-0": [1.0, 2.0], "plush a to b at 1:8": [3.0, 5.0], "plush b to a at 1:8": [8.0]})
+        {'room-0': [1.0, 2.0], 'plush': [4.0, 8.0]}
+    """
+    samples: dict[str, list[list[float | None]]] = {}
+    for scene, values in scenes.items():
+        samples.setdefault(independent(scene), []).append(list(values))
+    return {
+        name: parts[0] if len(parts) == 1 else [_defined_mean(part) for part in parts]
+        for name, parts in samples.items()
+    }
+
+
+def _defined_mean(values: Sequence[float | None]) -> float | None:
+    known, _ = defined(values)
+    return float(known.mean()) if len(known) else None
 
 
 def _curve(cell: Cell, order: str, key: str) -> Curve | None:
@@ -245,3 +295,9 @@ def per_scene(cells: Sequence[Cell], methods: Sequence[str], key: str) -> dict[s
                 values.setdefault(cell["scene"], []).append(found)
         result[method] = {scene: float(np.mean(each)) for scene, each in values.items()}
     return result
+
+
+def per_sample(found: Mapping[str, float]) -> dict[str, float]:
+    """Scene -> value, with a capture in the place of its pairs of sweeps, by the mean of theirs."""
+    values = by_sample({scene: [value] for scene, value in found.items()})
+    return {name: float(np.mean(each)) for name, each in values.items()}  # type: ignore[arg-type]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -169,7 +170,8 @@ def draw_comparison(
                 if line == 0:
                     axes.set_title(heading, fontsize=9.5, color="#222222", pad=3)
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110, format="png", metadata={"Software": None})
+    dpi = max(110, math.ceil(width / (0.97 * cell)))  # no pixel of a picture is lost
+    figure.savefig(path, dpi=dpi, format="png", metadata={"Software": None})
 
 
 def _depth_range(depth: NDArray[Any], limit: float) -> tuple[float, float]:

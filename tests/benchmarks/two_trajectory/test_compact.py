@@ -72,6 +72,16 @@ def test_every_cell_comes_back(results, tmp_path):
     assert by["a", "bold"]["curves"]["own"] != by["a", "bold"]["curves"]["spread"]
 
 
+def test_several_factors_and_idle_losses_come_back(tmp_path):
+    more = {"factor": [0.123456789, 0.01], "points": "12ab34cd", "changed_share": 0.25, "idle": ["sight_lines"]}
+    cells = [cell("bold", "a", 0.5, **more), cell("field", "a", 0.6)]
+    write_compact(tmp_path / "r.json", {"cells": cells, "rows": summary_rows(cells)})
+    first, second = read_expanded(tmp_path / "r.json")["cells"]
+    assert {key: first[key] for key in more} == more
+    assert not second.get("idle")
+    assert second.get("changed_share") is None  # a row from before it was recorded: nothing is said of it
+
+
 def test_what_is_compact_does_not_change(results):
     once = json.loads(json.dumps(compact(results)))
     assert compact(once) == once

@@ -1,5 +1,6 @@
 """Parts of benchmarks/two_trajectory/run.py: what its tables say, and each method on a scene of a few pixels."""
 
+import dataclasses
 import functools
 import importlib
 import json
@@ -11,6 +12,9 @@ import pytest
 pytest.importorskip("torch")
 
 from unghost_tests.benches import check_short, refusal
+from unghost_tests.depth_points import depth_points
+
+from unghost.regularizer.settings import RegularizerSettings
 
 ROOT = Path(__file__).parents[3]
 PARTS = {
@@ -184,6 +188,7 @@ def stage(bench, monkeypatch):
     # a field that has hardly been trained puts everything far away
     monkeypatch.setattr(scenes.TrajectoryScene, "extent", scenes.SceneExtent(limit=60.0, unit=1.0))
     scene = scenes.synthetic_scene(2026, "room-1", photos=4, views=2, width=24, resolution=24)
+    scene = dataclasses.replace(scene, points=depth_points(scene))
     pseudo = scene.pseudo(lambda cameras: np.zeros(0))
     return bench["trajectory_scores"].Stage(scene, pseudo, scene.truth(pseudo), 20, 2)
 
@@ -219,10 +224,22 @@ def test_every_method_runs_and_a_run_goes_on_where_it_was_broken_off(bench, stag
         assert {"own", "spread", "photos"} == set(curves)
         assert len({tuple(each["coverage"]) for each in curves.values()}) == 1
         assert (curves["own"] != curves["spread"]) == (
-            method == "photo-doubt" or "bayes" in method or "clean" in method or "restor" in method or "once" in method
+            method in ("photo-doubt", "scratch+all")
+            or any(part in method for part in ("bayes", "clean", "restor", "once", "sight-lines"))
         )
     assert {"own", "spread"} == set(done["bayes-rays @ 0.9"]["curves"])
     assert done["clean"]["trained_steps"] == 0
+    assert done["scratch"]["psnr"] == done["fitted"]["psnr"]
+    assert done["scratch"]["trained_steps"] == done["scratch+all"]["trained_steps"] == stage.fit_steps
+    assert done["scratch"]["seconds"] > 0
+    trained = [row for row in done.values() if row["trained_steps"] and row["method"] != "scratch"]
+    assert all(row["changed_share"] > 0 for row in trained if "@" not in row["method"])
+    assert done["fitted"]["changed_share"] == done["scratch"]["changed_share"] == 0
+    with_points = {name for name, row in done.items() if row.get("points")}
+    assert with_points == set(methods.WITH_POINTS)
+    keys = ("psnr_visible", "free_space_error", "disparity_mae")
+    apart = {name: [done[name][key] for key in keys] for name in ("visibility", *methods.WITH_POINTS)}
+    assert [name for name in apart if apart[name] == apart["visibility"]] == ["visibility"]  # each does something
     stored = json.loads((tmp_path / "two_trajectory.json").read_text())
     assert all(done[method]["curves"]["own"]["coverage"][0] == done[method]["coverage"] for method in options.methods)
     assert {row["method"] for row in stored["rows"]} == set(done)
@@ -241,6 +258,53 @@ def test_every_method_runs_and_a_run_goes_on_where_it_was_broken_off(bench, stag
     monkeypatch.setattr(main, "fitted", lambda *ignored: pytest.fail("a finished row was done again"))
     main.run_stage(options, stage, cache, again, main.Plan([*options.methods], dict.fromkeys(options.methods, 1.0)))
     assert len(again.cells) == len(ledger.cells)
+
+
+def test_a_row_with_other_factors_takes_the_place_of_the_old_one(bench, tmp_path):
+    main = bench["two_trajectory"]
+    ledger = main.Ledger(main.Options(out=tmp_path, cache=tmp_path))
+    row = {"table": "main", "scene": "a", "seed": 0, "convention": "proper", "coverage": 0.5}
+    old = ("tv", "tv @ 0.3", "tv @ 0.5", "field")
+    ledger.add([{**row, "method": name, "psnr": 20.0, "factor": [0.1, 0.2]} for name in old])
+    ledger.add([{**row, "method": name, "psnr": 30.0, "factor": [0.1, 0.3]} for name in ("tv", "tv @ 0.3")])
+    ledger.add([{**row, "method": "tv", "seed": 1, "psnr": 40.0, "factor": [0.1, 0.3]}])
+    ledger.add([{**row, "method": "field", "psnr": 50.0, "factor": [0.1, 0.2]}])  # the same once more: both stay
+    found = [(cell["method"], cell["seed"], cell["psnr"]) for cell in ledger.cells]
+    assert sorted(found) == [
+        ("field", 0, 20.0),
+        ("field", 0, 50.0),
+        ("tv", 0, 30.0),
+        ("tv", 1, 40.0),
+        ("tv @ 0.3", 0, 30.0),
+    ]
+
+
+def test_pairs_of_sweeps(bench, tmp_path, monkeypatch, capsys):
+    main = bench["two_trajectory"]
+    folder = tmp_path / "a:b"
+    options = main.Options(capture=folder, train="one", eval="two", capture_pairs=(f"{folder}:two:one",))
+    assert options.pairs() == [(folder, "one", "two"), (folder, "two", "one")]
+    with pytest.raises(ValueError, match="--capture-pairs: must be FOLDER:TRAIN:EVAL each, got room:one"):
+        main.Options(capture_pairs=("room:one",)).pairs()
+    assert "no nowhere" in refusal(main, monkeypatch, capsys, "--capture-pairs", "nowhere:one:two")
+
+
+def test_pairs_of_one_capture_count_as_one(bench):
+    tables, page = bench["trajectory_tables"], bench["trajectory_page"]
+    scores = {"room-0": (1.0, 0.0), "plush a to b at 1:8": (2.0, 0.0), "plush b to a at 1:8": (6.0, 0.0)}
+    cells = [
+        cell(method, scene, 0.5, [(0.5, value)], psnr=value)
+        for scene, values in scores.items()
+        for method, value in zip(("clean", "field"), values)
+    ]
+    rows = {row["method"]: row for row in tables.summary_rows(cells)}
+    assert rows["clean"]["psnr"] == (1.0 + (2.0 + 6.0) / 2) / 2
+    assert rows["clean"]["runs"] == 3
+    apart = page.difference(cells, "clean", "field", "psnr", 1)
+    assert (apart.mean, apart.count) == (2.5, 2)
+    text = page.scenes_page({"cells": cells, "rows": tables.summary_rows(cells)})
+    assert "| method | plush a to b at 1:8 | plush b to a at 1:8 | room-0 |" in text
+    assert "| clean | 2.00 | 6.00 | 1.00 |" in text
 
 
 def test_processes_share_the_file(bench, tmp_path):
@@ -321,7 +385,24 @@ def test_the_factors_are_those_that_the_sweep_chose(bench):
     stored = json.loads((ROOT / "docs" / "results" / "two_trajectory_sweep.json").read_text())
     chosen = {row["table"]: float(row["method"].split()[1]) for row in stored["rows"] if row.get("chosen")}
     weights, sweep = bench["trajectory_job"].Weights(), importlib.import_module("benchmarks.two_trajectory.sweep")
-    assert chosen == {factor: getattr(weights, factor) for factor in sweep.FACTORS}
+    assert chosen == {factor: getattr(weights, factor) for factor in sweep.FACTORS if factor in chosen}
+    assert set(sweep.FACTORS) - set(chosen) <= set(sweep.POINT_LOSSES)  # those were added before anybody swept them
+
+
+def test_every_factor_is_swept_by_a_method_that_depends_on_it(bench):
+    sweep, methods = importlib.import_module("benchmarks.two_trajectory.sweep"), bench["trajectory_methods"]
+    fields = {field.name for field in dataclasses.fields(bench["trajectory_job"].Weights)}
+    assert set(sweep.FACTORS) == fields == {name for names in methods.FACTORS_OF.values() for name in names}
+    assert set(methods.FACTORS_OF) <= set(methods.METHODS)
+    assert sweep.swept_by("tv") == "visibility+tv"
+    assert sweep.swept_by("sight_lines") == sweep.swept_by("end_points") == "visibility+sight-lines"
+    assert all(sweep.swept_by(name) in methods.WITH_POINTS for name in sweep.POINT_LOSSES)
+
+
+def test_our_sight_lines_weigh_as_much_as_by_default(bench):
+    weights = bench["trajectory_job"].Weights()
+    defaults = RegularizerSettings()
+    assert (weights.sight_lines, weights.end_points) == (defaults.sight_line_weight, defaults.end_point_weight)
 
 
 def test_every_eighth_photo_is_judged_from_where_it_was_taken(bench, monkeypatch):

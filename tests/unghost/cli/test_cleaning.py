@@ -143,7 +143,7 @@ def test_cameras_of_other_tools_are_brought_into_the_world_of_the_file(tmp_path)
     (tmp_path / "model").mkdir()
     (tmp_path / "model" / "cameras.json").write_text(json.dumps([entry]))
     (tmp_path / "export").mkdir()
-    words = ("views", 0, 0.5, tmp_path / "model" / "cameras.json", tmp_path / "export" / "splat.ply")
+    words = ("views", 0, 0.5, tmp_path / "model" / "cameras.json", None, tmp_path / "export" / "splat.ply")
     assert cleaning._judging(*words)["cameras"].origins.tolist() == [[1, 2, 3]]
     motion = {"transform": [[1, 0, 0, 10], [0, 1, 0, 0], [0, 0, 1, 0]], "scale": 0.5}
     (tmp_path / "export" / "dataparser_transforms.json").write_text(json.dumps(motion))
