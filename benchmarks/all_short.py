@@ -30,6 +30,7 @@ WITHOUT_DATA = (
     "regularizer.rooms",
     "regularizer.sight_lines",
     "regularizer.stability",
+    "release.recalibrate",
     "release.ship",
     "release.train_diffusion",
     "release.training_speed",

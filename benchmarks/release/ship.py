@@ -5,8 +5,13 @@
 
 `clean` is run on demo rooms that are used for nothing else (the demo shows room 0), at every candidate. The
 largest one that keeps the wanted share of the surface, mean over the rooms, goes into the manifest. How the
-thresholds of single cubes differ from it: `clean` has the last word on pieces, pores and skirts of surfaces. No
-cameras are told, so a model that takes view counts does without them here.
+thresholds of single cubes differ from it: `clean` has the last word on pieces, pores and skirts of surfaces. A model
+that takes support and crossings gets the room's cameras and simulated sparse points; one that takes view counts alone
+does without cameras here.
+
+With `--calibrate`, folders of harvested shards that were not trained on, the network's last layer is changed so that
+``(x0_pred + 1) / 2`` is the probability that an opaque voxel is surface (`calibration.py`), and the threshold must keep
+the wanted share of the surface there, too (`--kept-harvest`).
 
 Writes NAME.safetensors and NAME.onnx among the weights, and the candidates' scores into ``threshold_NAME.json``.
 """
@@ -24,18 +29,22 @@ import tyro
 
 from unghost import load_denoiser
 from unghost.cleaning.pipeline import clean
+from unghost.core.channels import SUPPORT
 from unghost.core.results import build_results, write_results
 from unghost.demo.run import score
 from unghost.denoisers import WEIGHTS
 from unghost.export.onnx.quantization import export_precisions
 from unghost.fields.adapters.grids import cell_centers, grid_density_fn
 from unghost.prior.checkpoint import load_model, save_model
-from unghost.scenes.labelled_room.room import AABB, SHAPE, build_room
+from unghost.prior.networks.restoration import RestorationNet
+from unghost.scenes.labelled_room.observations import room_cameras, room_points
+from unghost.scenes.labelled_room.room import AABB, SHAPE, Room, build_room
 
 from ..options import NOT_GIVEN, SHORT_RESULTS, BenchmarkOptions, give_up, parse
 from ..progress import say, wrote
+from .calibration import bake, calibration_error, fit_platt, judged_voxels, kept_and_removed
 
-CANDIDATES = tuple(tenth / 10 for tenth in range(-6, 10))
+CANDIDATES = (-0.98, -0.95, *(tenth / 10 for tenth in range(-9, 10)))
 
 
 @dataclass(frozen=True)
@@ -48,7 +57,10 @@ class Options(BenchmarkOptions):
         half: store the weights in half precision; the model computes in float32 all the same.
         rooms: seeds of the rooms.
         kept: share of the surface that must stay.
-        candidates: thresholds to try at most, of those from -.6 up to .9.
+        candidates: thresholds to try at most, of those from -.98 up to .9.
+        calibrate: folders of harvested shards to calibrate on; none for no calibration.
+        kept_harvest: share of the surface that must stay there.
+        cubes: of each shard.
         weights: where the shipped models are.
     """
 
@@ -67,6 +79,9 @@ class Options(BenchmarkOptions):
     rooms: tuple[int, ...] = (10, 11, 12, 13)
     kept: float = 0.985
     candidates: int = len(CANDIDATES)
+    calibrate: tuple[Path, ...] = ()
+    kept_harvest: float = 0.97
+    cubes: int = 96
     weights: Path = WEIGHTS
 
 
@@ -82,13 +97,20 @@ class _Advising:
         return self._denoiser(channels, timestep, edge_fraction)
 
 
+def observed(room: Room, seed: int) -> dict[str, Any]:
+    """Cameras in a room, and its sparse points."""
+    cameras = room_cameras(room, seed=seed)
+    return {"cameras": cameras, "points": room_points(room, cameras, seed=seed)}
+
+
 def row_of(denoiser: Any, threshold: float, rooms: tuple[int, ...]) -> dict[str, Any]:
     """Mean scores of ``clean`` at ``threshold``."""
     advised = _Advising(denoiser, threshold)
     found = []
     for seed in rooms:
         room = build_room(seed)
-        mask = clean(grid_density_fn(room.density, AABB), AABB, denoiser=advised, field_pitch=room.pitch)
+        known = observed(room, seed) if SUPPORT in denoiser.manifest.channels else {}
+        mask = clean(grid_density_fn(room.density, AABB), AABB, denoiser=advised, field_pitch=room.pitch, **known)
         found.append(score(room, np.asarray(mask.keep(cell_centers(AABB, SHAPE)))))
     keys = ("floater_recall", "floater_precision", "surface_kept", "iou_before", "iou")
     means = {key: float(np.mean([scores[key] for scores in found])) for key in keys}
@@ -109,10 +131,38 @@ def choose(denoiser: Any, options: Options) -> tuple[float, list[dict[str, Any]]
     return max(good), rows
 
 
-def written(options: Options, folder: Path, threshold: float) -> dict[str, Path]:
-    """The two files of the model in ``folder``."""
+def calibrated(options: Options) -> tuple[Any, dict[str, Any], list[dict[str, Any]]]:
+    """The model with its last layer calibrated, what to note of it, and what each candidate keeps of the cubes."""
     model = load_model(options.checkpoint)
-    manifest = dataclasses.replace(model.manifest, removal_threshold=threshold)
+    if not options.calibrate:
+        return model, {}, []
+    if not isinstance(model.network, RestorationNet):
+        raise SystemExit("ship: --calibrate is for restoration priors; nothing is written")
+    timestep = model.manifest.default_timestep
+    logits, surface = judged_voxels(model.network, options.calibrate, timestep=timestep, cubes=options.cubes)
+    scale, shift = fit_platt(logits, surface)
+    bake(model.network, scale, shift)
+    stated = scale * logits + shift
+    note = {
+        "scale": scale,
+        "shift": shift,
+        "voxels": len(logits),
+        "shards": [folder.name for folder in options.calibrate],
+        "error_before": calibration_error(logits, surface),
+        "error": calibration_error(stated, surface),
+    }
+    rows = []
+    for threshold in CANDIDATES:
+        kept, removed = kept_and_removed(stated, surface, threshold)
+        rows.append({"method": "harvest", "threshold": threshold, "surface_kept": kept, "floater_recall": removed})
+    return model, {"calibration": note}, rows
+
+
+def written(options: Options, folder: Path, threshold: float, model: Any, about: dict[str, Any]) -> dict[str, Path]:
+    """The two files of the model in ``folder``."""
+    manifest = dataclasses.replace(
+        model.manifest, removal_threshold=threshold, training={**model.manifest.training, **about}
+    )
     checkpoint = folder / f"{options.name}.safetensors"
     save_model(checkpoint, model.network, manifest, half=options.half)
     precision = "fp16" if options.half else "fp32"
@@ -126,20 +176,31 @@ def record(options: Options, rows: list[dict[str, Any]]) -> None:
     write_results(options.out / f"threshold_{options.name}.json", results)
 
 
-def main() -> None:
-    options = parse(Options, __doc__)
-    if not options.name:
-        give_up(Options, "needs NAME, the name of the shipped model")
+def ship(options: Options) -> None:
+    """Calibrate, choose the threshold, write the files and the record."""
     options.weights.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as scratch:
-        threshold, rows = choose(load_denoiser(written(options, Path(scratch), 0.0)[".onnx"]), options)
-        for suffix, path in written(options, Path(scratch), threshold).items():
+        model, about, harvested = calibrated(options)
+        say(" ".join(f"{key}={value}" for key, value in about.get("calibration", {}).items()))
+        threshold, rows = choose(load_denoiser(written(options, Path(scratch), 0.0, model, about)[".onnx"]), options)
+        bearable = [row["threshold"] for row in harvested if row["surface_kept"] >= options.kept_harvest]
+        if harvested:
+            threshold = min(threshold, max(bearable, default=CANDIDATES[0]))
+        rows += harvested
+        for suffix, path in written(options, Path(scratch), threshold, model, about).items():
             (options.weights / f"{options.name}{suffix}").write_bytes(path.read_bytes())
-    rows = [row | {"chosen": row["threshold"] == threshold} for row in rows]
+    rows = [row | {"chosen": row["method"] == "clean" and row["threshold"] == threshold} for row in rows]
     record(options, rows)
     say(f"{options.name}: threshold {threshold:g}")
     files = [options.weights / f"{options.name}{suffix}" for suffix in (".safetensors", ".onnx")]
     wrote(*files, options.out / f"threshold_{options.name}.json")
+
+
+def main() -> None:
+    options = parse(Options, __doc__)
+    if not options.name:
+        give_up(Options, "needs NAME, the name of the shipped model")
+    ship(options)
 
 
 if __name__ == "__main__":

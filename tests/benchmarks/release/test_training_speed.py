@@ -39,7 +39,7 @@ def test_loader_network_and_both(shard_paths, tmp_path, monkeypatch):
     assert [(row["method"], len(row["channels"]), row["memory"]) for row in found["rows"]] == [
         ("xs", 1, "returned"),
         ("xs", 1, "kept"),
-        ("xs", 4, "kept"),
+        ("xs", 6, "kept"),
     ]
     for row in found["rows"]:
         assert row["loader_over_network"] == pytest.approx(
