@@ -9,6 +9,8 @@ surface  two photos or more have their depth within three quarters of a cell the
 free     two photos or more look through, more than one and a half cells in front of their depth, and more than see a
          surface there; and a training photo looks there
 ignore   the rest
+
+The evidence in the cubes, support and crossings, is of points triangulated from the training sweep's photos alone.
 """
 
 from __future__ import annotations
@@ -31,6 +33,7 @@ from unghost.data_recipes.harvest.config import HarvestConfig
 from unghost.data_recipes.harvest.labels import BEHIND_BAND, FREE_BAND, SURFACE_BAND
 from unghost.data_recipes.harvest.run import harvest_cubes
 from unghost.evaluation.captures.loading import load_capture
+from unghost.evaluation.captures.triangulation import triangulate
 from unghost.evaluation.scoring.depths import optical_depth
 
 from ..fit_cache import FitCache, code_hash, file_hash
@@ -137,6 +140,8 @@ def capture_shards(
     truth = PseudoTruth(
         sweep(train).cameras, pseudo.aabb, both.cameras, optical_depth(np.asarray(views["depth"]), both.cameras)
     )
+    targets = [out / f"seed-{seed}" for seed in seeds]
+    points = None if all(target.exists() for target in targets) else triangulate(loaded, loaded.split(train))
     shards = []
     for seed in seeds:
         target = out / f"seed-{seed}"
@@ -145,7 +150,9 @@ def capture_shards(
             continue
         say(f"field of {train}, seed {seed}")
         fitted, record = fit_field(options, fits, "field", sweep(train), seed)
-        arrays = harvest_cubes(np.random.default_rng([seed, 0xCA9]), fitted, truth, HarvestConfig(cubes=cubes))
+        assert points is not None
+        rng = np.random.default_rng([seed, 0xCA9])
+        arrays = harvest_cubes(rng, fitted, truth, HarvestConfig(cubes=cubes), points=[points])
         arrays["group"] = np.full(cubes, seed, dtype=np.int32)
         provenance = {
             "recipe": "capture",
@@ -153,6 +160,7 @@ def capture_shards(
             "train": train,
             "better": list(better),
             "seed": seed,
+            "points": len(points),
             "field": "dense",
             "sha256": record["sha256"],
             "licence": "see the capture",
