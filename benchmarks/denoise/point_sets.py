@@ -33,6 +33,8 @@ class Options(BenchmarkOptions):
         points: lowest and highest number of points of a set.
         noise: standard deviation of a keypoint, pixels of the matched photos.
         wrong: share of wrong points.
+        contrast, repeatability: of :class:`~unghost.scenes.sparse_points.MatchingConfig`; as easy as the harvest has
+            them, so that as many points come out as were asked for.
         meshes: folder of meshes that the harvest had.
     """
 
@@ -43,12 +45,20 @@ class Options(BenchmarkOptions):
     points: tuple[float, float] = (3000.0, 10_000.0)
     noise: float = 0.5
     wrong: float = 0.01
+    contrast: float = 0.003
+    repeatability: float = 0.6
     meshes: Path | None = None
 
 
 def main(options: Options) -> None:
     """Copy every shard."""
-    matching = MatchingConfig(points=options.points, noise=(options.noise,) * 2, wrong=(options.wrong,) * 2)
+    matching = MatchingConfig(
+        points=options.points,
+        noise=(options.noise,) * 2,
+        wrong=(options.wrong,) * 2,
+        contrast=(options.contrast,) * 2,
+        repeatability=(options.repeatability,) * 2,
+    )
     count = replace_evidence(options.source, options.to, matching=matching, mesh_root=options.meshes, log=say)
     say(f"{count} shards")
     wrote(options.to)
