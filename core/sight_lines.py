@@ -39,6 +39,7 @@ class SightLines:
         starts, ends: ``(L, 3)`` of the segments, scene units: from the camera to the point less its margin, as far as
             they lie in the box (of a shell: in the box and beyond the next smaller one).
         targets: ``(L, 3)`` the points that were observed, scene units; some may lie outside the box.
+        uncertainty: ``(L,)`` of these points along their rays, scene units; 0 where unknown.
         crossing_count: ``(X, Y, Z)`` int32, how many segments pass through each cell.
         support_sum: ``(X, Y, Z)`` float32 at the cells' centres, how many points lie near, each with a tent-shaped
             weight that is 1 at the point and 0 from ``REACH`` cells on, along each axis.
@@ -49,7 +50,8 @@ class SightLines:
         supported, supported_block: the same of ``support_sum`` and the points.
         shells: the same for boxes that are twice as wide each, without what the next smaller one holds; empty unless
             ``reach`` > 1.
-        far_starts, far_targets: ``(F, 3)`` cameras of, and points at the end of, lines that end in the shells.
+        far_starts, far_targets, far_uncertainty: the cameras of ``(F, 3)``, the points at the end of ``(F, 3)``, and
+            their uncertainty ``(F,)``, for lines that end in the shells.
         report: counts of ``observations`` and, of these, ``too_near`` (nothing is left before the margin, or the rays
             do not determine the point), ``outside`` (the segment does not meet the box) and ``outvoted``.
 
@@ -67,6 +69,7 @@ class SightLines:
     starts: FloatArray
     ends: FloatArray
     targets: FloatArray
+    uncertainty: FloatArray
     crossed: NDArray[np.int32]
     crossed_block: Block
     supported: NDArray[np.float32]
@@ -76,6 +79,7 @@ class SightLines:
     shells: tuple[SightLines, ...] = ()
     far_starts: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     far_targets: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    far_uncertainty: FloatArray = field(default_factory=lambda: np.zeros(0))
     report: dict[str, int] = field(default_factory=dict)
 
     @classmethod
@@ -139,7 +143,13 @@ class SightLines:
         targets = points.xyz[points.point[ends]]
         far = votes.right[points.point[ends]] & _within(targets, inner) & ~_within(targets, box)
         origins = cameras.origins[points.camera[ends]]
-        return dataclasses.replace(result, shells=tuple(shells), far_starts=origins[far], far_targets=targets[far])
+        return dataclasses.replace(
+            result,
+            shells=tuple(shells),
+            far_starts=origins[far],
+            far_targets=targets[far],
+            far_uncertainty=_known_uncertainty(points)[points.point[ends]][far],
+        )
 
     @classmethod
     def _traced(
@@ -189,9 +199,11 @@ class SightLines:
         report["outvoted"] = _number_of(observation[~kept], len(points.point))
         support = _tents(places[right & here], around)
         starts, ends = (origin + each[kept] * pitch for each in (starts, ends))
-        targets = points.xyz[owner[kept]]
+        targets, uncertainty = points.xyz[owner[kept]], _known_uncertainty(points)[owner[kept]]
         crossed = count.astype(np.int32)
-        return cls(starts, ends, targets, crossed, block, support, around, box, float(pitch), report=report)
+        return cls(
+            starts, ends, targets, uncertainty, crossed, block, support, around, box, float(pitch), report=report
+        )
 
     def __len__(self) -> int:
         """Number of segments, those of the shells too."""
@@ -249,8 +261,9 @@ class SightLines:
         """Draw points about the observed points of random sight lines, along the lines, stratified.
 
         Args:
-            rng: draws lines with replacement among those whose point lies in the box or in a shell.
-            count: number of lines; none come back if no point lies there.
+            rng: draws lines with replacement among those whose point lies in the box or in a shell, and whose
+                uncertainty is at most ``reach``: of any other it is not known that matter is within reach.
+            count: number of lines; none come back if there is no such line.
             reach: how far before and behind the point, scene units. Beyond the box it grows as the cells of a
                 contracted field do.
             samples: points a line.
@@ -258,10 +271,12 @@ class SightLines:
         Returns:
             positions ``(count, samples, 3)`` and the length that they cover: ``2 * reach``, with shells ``(count,)``.
         """
-        targets, directions = self._ends
-        if not len(targets):
+        targets, directions, uncertainty = self._ends
+        most = reach * contracted_growth(targets, self.aabb, reach) if self.shells else reach
+        certain = np.flatnonzero(uncertainty <= most)
+        if not len(certain):
             return np.zeros((0, samples, 3)), 2 * reach
-        which = rng.integers(len(targets), size=count)
+        which = certain[rng.integers(len(certain), size=count)]
         offset = reach * (2 * (np.arange(samples) + rng.random((count, samples))) / samples - 1)
         covered: float | FloatArray = 2 * reach
         if self.shells:
@@ -278,12 +293,13 @@ class SightLines:
         return starts, along, np.linalg.norm(along, axis=1)
 
     @functools.cached_property
-    def _ends(self) -> tuple[FloatArray, FloatArray]:
+    def _ends(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Points that lines lead to, in the box and then beyond it, and the lines' directions ``(N, 3)``."""
         here = _within(self.targets, self.aabb)
         targets = np.concatenate([self.targets[here], self.far_targets])
         along = targets - np.concatenate([self.starts[here], self.far_starts])
-        return targets, along / np.linalg.norm(along, axis=1, keepdims=True)
+        uncertainty = np.concatenate([self.uncertainty[here], self.far_uncertainty])
+        return targets, along / np.linalg.norm(along, axis=1, keepdims=True), uncertainty
 
     @functools.cached_property
     def _crossings(self) -> tuple[Block, NDArray[np.float32], Any]:
@@ -381,6 +397,11 @@ def _grid_shape(box: FloatArray, pitch: float) -> tuple[int, ...]:
     return tuple(int(side) for side in np.maximum(sides, 1))
 
 
+def _known_uncertainty(points: SparsePoints) -> FloatArray:
+    """``(P,)``: 0 where it is unknown, inf where the rays do not determine it."""
+    return np.nan_to_num(points.uncertainty, nan=0.0, posinf=np.inf)
+
+
 def _segments(
     points: SparsePoints, cameras: Cameras, margin: FloatArray, sigmas: float
 ) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
@@ -388,7 +409,7 @@ def _segments(
     origins, targets = cameras.origins[points.camera], points.xyz[points.point]
     offset = targets - origins
     distance = np.linalg.norm(offset, axis=1)
-    uncertainty = np.nan_to_num(points.uncertainty, nan=0.0, posinf=np.inf)[points.point]
+    uncertainty = _known_uncertainty(points)[points.point]
     with np.errstate(invalid="ignore"):
         keep = distance - margin[points.point] - (sigmas * uncertainty if sigmas else 0.0)
         share = np.divide(keep, distance, out=np.zeros_like(distance), where=distance > 0)

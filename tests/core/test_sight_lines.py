@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -317,7 +319,11 @@ def test_far_points_are_finite_or_counted(scale):
     direction = np.random.default_rng(0).normal(size=(40, 3))
     xyz = scale * direction * np.logspace(3, 6, 40)[:, None]
     points = observed(xyz, cameras)
-    lines = SightLines.build(points, cameras, aabb=BOX * scale, pitch=0.1 * scale, margin_sigmas=0.0, reach=2.0**20)
+    options = {"aabb": BOX * scale, "pitch": 0.1 * scale, "reach": 2.0**20}
+    vague = SightLines.build(points, cameras, margin_sigmas=0.0, **options)
+    assert len(vague.sample_ends(np.random.default_rng(0), 100, reach=0.2 * scale)[0]) == 0
+    exact = dataclasses.replace(points, uncertainty=np.zeros(len(points)))
+    lines = SightLines.build(exact, cameras, margin_sigmas=0.0, **options)
     assert len(lines.shells) == 20
     assert (
         lines.report["observations"]
@@ -419,3 +425,20 @@ def test_a_point_at_a_camera_is_no_line_and_hides_none():
     lines = SightLines.build(given, cameras, aabb=BOX * 3, pitch=0.1, reach=3.0)
     assert lines.report["too_near"] == clean.report["too_near"] + 1
     np.testing.assert_array_equal(lines.crossing_count, clean.crossing_count)
+
+
+def test_ends_are_of_points_that_are_certain_enough():
+    """Of points that may lie farther off than what the term covers, it is not known that matter is there."""
+    cameras, xyz = spread()
+    points = observed(xyz, cameras)
+    sigma = np.where(np.arange(len(points)) % 2 == 0, 0.05, 0.3)
+    lines = SightLines.build(
+        dataclasses.replace(points, uncertainty=sigma), cameras, aabb=BOX, pitch=0.1, margin_sigmas=0.0
+    )
+    assert set(lines.uncertainty) == {0.05, 0.3}
+    places, _ = lines.sample_ends(np.random.default_rng(0), 400, reach=0.1)
+    middles = places.mean(axis=1)  # stratified about the point
+    nearest = np.linalg.norm(middles[:, None] - points.xyz, axis=2).argmin(axis=1)
+    assert len(places) == 400
+    assert (nearest % 2 == 0).mean() > 0.95
+    assert len(lines.sample_ends(np.random.default_rng(0), 9, reach=0.01)[0]) == 0
