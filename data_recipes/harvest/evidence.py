@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from ...core.config import from_dict, to_dict
 from ...core.errors import InvalidArgument
-from ...core.frames import cube_lattices
+from ...core.frames import RESOLUTION, cube_lattices
 from ...core.shards.finding import find_shards
 from ...core.shards.storage import ARRAYS, OPTIONAL_ARRAYS, read_shard, write_shard
 from ...core.sight_lines import SightLines
+from ...core.visibility.view_counts import count_views
 from .config import HarvestConfig
 from .context import evidence
 from .rooms import draw_objects_of
@@ -27,6 +28,10 @@ if TYPE_CHECKING:
 
 POINT_STREAM = 0x73666D  # keeps the points apart from all else that is drawn for a scene
 TOGETHER = 8  # consecutive cubes that share a set of points
+FINEST, LEVELS = (
+    0.008,
+    3,
+)  # pitch of the finest grid of a room's sight lines, and how many there are, twice as coarse each
 
 
 def point_sets(
@@ -50,6 +55,39 @@ def lines_of(
 ) -> list[SightLines]:
     """Sight lines of each set, on a grid of the field's own pitch."""
     return [SightLines.build(each, cameras, aabb=aabb, pitch=pitch) for each in points]
+
+
+def easy_matching() -> MatchingConfig:
+    """Matching that finds many points: a room's cells are finer than those of a field that was fitted to it."""
+    from ...scenes.sparse_points import MatchingConfig
+
+    return MatchingConfig(points=(1000.0, 20_000.0), contrast=(0.002, 0.006), repeatability=(0.4, 0.7))
+
+
+def room_evidence(
+    points: list[SparsePoints], cameras: Cameras, frames: NDArray[np.float64]
+) -> dict[str, NDArray[np.uint8]]:
+    """View counts, support and crossings of cubes of a perfect field, each at its own pitch.
+
+    Args:
+        points: sets of sparse points; consecutive cubes share one.
+        cameras: that observed them.
+        frames: ``(N, 13)`` of the cubes.
+    """
+    aabb = np.array([[-1.0] * 3, [1.0] * 3])
+    edges, rotations = frames[:, 3], frames[:, 4:].reshape(-1, 3, 3)
+    cell = edges / RESOLUTION / np.where(np.arange(len(frames)) % 3 == 2, 2.0, 1.0)  # some at twice the field's pitch
+    level = np.clip(np.rint(np.log2(cell / FINEST)), 0, LEVELS - 1).astype(np.int64)
+    found = {name: np.zeros((len(frames), *(RESOLUTION,) * 3), dtype=np.uint8) for name in ("support", "crossings")}
+    group = np.arange(len(frames)) // TOGETHER % len(points)
+    for number, pitch_level in sorted(set(zip(group.tolist(), level.tolist()))):
+        (lines,) = lines_of([points[number]], cameras, aabb=aabb, pitch=FINEST * 2.0**pitch_level)
+        rows = np.flatnonzero((group == number) & (level == pitch_level))
+        for part in np.array_split(rows, -(-len(rows) // TOGETHER)):
+            lattice = cube_lattices(frames[part, :3], edges[part], rotations[part])
+            for name, values in evidence(lines, lattice).items():
+                found[name][part] = values
+    return {**found, "view_count": count_views(cameras, frames[:, :3], edges, rotations)}
 
 
 def replace_evidence(

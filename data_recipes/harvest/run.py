@@ -38,7 +38,7 @@ from ..engines import Engine, LocalEngine, open_engine
 from ..folder_lock import locked
 from .config import HarvestConfig
 from .context import evidence, signed_opacity, surroundings
-from .evidence import TOGETHER, lines_of, point_sets
+from .evidence import TOGETHER, easy_matching, lines_of, point_sets, room_evidence
 from .labels import HIDDEN, Labeller, Truth, check_fit, severity_of
 from .resume import finished, scene_folder
 from .rooms import draw_objects_of, room_cubes
@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from ...scenes.generator import PhotographedScene
 
 OBSERVER_STREAM = 0x6F6273  # keeps the other sweep apart from all else
+ROOM_PHOTOS = 0x70686F  # the same for the photos of rooms without a field
 EARLY = 0.45  # share of the fit at which the first cubes are taken
 QUERY = 1 << 17  # points that are worked on at a time
 
@@ -244,12 +245,27 @@ def harvest_scene(
 def room_scene(
     seed: int, index: int, config: HarvestConfig, mesh_root: str | Path | None = None
 ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """Cubes of scene ``index`` without a field, see :func:`.rooms.room_cubes`; nothing is fitted."""
-    from ...scenes.generator import random_scene
+    """Cubes of scene ``index`` without a field, see :func:`.rooms.room_cubes`; nothing is fitted.
+
+    Photos are taken for view counts and sparse points alone; without a free path for them the cubes go without.
+    """
+    from ...scenes.generator import photograph, random_scene
 
     rng = np.random.default_rng([seed, index, 1])
     objects, meshes = draw_objects_of(seed, index, config, mesh_root)
-    arrays = room_cubes(rng, random_scene(rng, objects), config)
+    scene = random_scene(rng, objects)
+    arrays = room_cubes(rng, scene, config)
+    other = np.random.default_rng([seed, index, ROOM_PHOTOS])
+    width, count = (int(other.integers(low, high + 1)) for low, high in (config.photo_width, config.photos))
+    try:
+        photographed = photograph(other, scene, count=count, width=width, height=width * 3 // 4)
+    except RuntimeError:
+        photographed = None
+    if photographed is not None and config.point_sets:
+        points = point_sets(
+            photographed, seed=seed, index=index, snapshot=0, sets=config.point_sets, matching=easy_matching()
+        )
+        arrays |= room_evidence(points, photographed.cameras, arrays["frames"])
     arrays["group"] = np.full(config.cubes, index, dtype=np.int32)
     provenance: dict[str, Any] = {"recipe": "rooms", "seed": seed, "scene": index, "config": to_dict(config)}
     licences = sorted({"generated", *(mesh["licence"] for mesh in meshes)})

@@ -3,11 +3,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from unghost.core.shards.packing import dequantize_share
+from unghost.core.occupancy import FREE_LABEL, SURFACE_LABEL
+from unghost.core.shards.packing import dequantize_share, unpack_labels
 from unghost.core.shards.storage import ARRAYS, read_shard, write_shard
 from unghost.data_recipes.harvest.config import HarvestConfig
 from unghost.data_recipes.harvest.evidence import replace_evidence
-from unghost.data_recipes.harvest.run import harvest
+from unghost.data_recipes.harvest.run import harvest, room_scene
 from unghost.scenes.sparse_points import MatchingConfig
 
 pytest.importorskip("torch")
@@ -88,3 +89,19 @@ def test_shards_that_cannot_be_copied_are_refused(harvested, tmp_path):
         write_shard(folder / "s", arrays, {**shard.provenance, **changes}, kind="harvest")
         with pytest.raises(ValueError, match=message):
             replace_evidence(folder, tmp_path / "b")
+
+
+@pytest.mark.slow
+def test_rooms_without_a_field_have_evidence_too():
+    """The cubes are those of a room without it; support lies on surfaces, crossings in the air."""
+    config = replace(SMALL, cubes=40, photos=(12, 14), photo_width=(40, 48), room_pitch=(0.02, 0.05))
+    arrays, _ = room_scene(1000, 5, config)
+    plain, _ = room_scene(1000, 5, replace(config, point_sets=0))
+    assert "support" not in plain
+    for name in ("inputs", "labels", "frames"):
+        np.testing.assert_array_equal(arrays[name], plain[name])
+    labels = unpack_labels(arrays["labels"])
+    support, crossings = arrays["support"] > 0, arrays["crossings"] > 0
+    assert support[labels == SURFACE_LABEL].mean() > 2 * support[labels == FREE_LABEL].mean()
+    assert crossings[labels == FREE_LABEL].mean() > 2 * crossings[labels == SURFACE_LABEL].mean()
+    assert arrays["view_count"].max() >= 5
