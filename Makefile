@@ -15,7 +15,7 @@ BROWSERS := chromium chromium-browser google-chrome google-chrome-stable
 
 NERFSTUDIO := .venv-nerfstudio
 NERFSTUDIO_NEEDS := 'viser==0.2.7' 'tyro<0.10' tensorboard 'protobuf<=3.20.3' torchmetrics jaxtyping \
-	opencv-python-headless matplotlib splines rich msgpack safetensors tqdm onnxruntime pyyaml
+	opencv-python-headless matplotlib splines rich msgpack safetensors tqdm onnxruntime pyyaml pycolmap
 
 NERFBASELINES := .venv-nerfbaselines
 NERFBASELINES_NEEDS := 'numpy<2' opencv-python-headless click tqdm Pillow matplotlib plyfile tensorboard scipy \

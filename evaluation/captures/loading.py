@@ -21,13 +21,12 @@ from ...core.cameras import Cameras
 from ...core.errors import InvalidArgument, InvalidFile, MissingFile
 from ...core.io import read_json
 from ...core.sparse_points import SparsePoints, warn_if_not_in_view
-from .alignment import align_poses
 from .colmap import find_model, has_model, image_names, read_model
 from .dataparser import applied_motion, find_dataparser, into_the_trained_world, warn_if_exported
 from .inria import FILE as INRIA_FILE
 from .inria import cameras_as_frames
 from .photos import RESIZED, find_photos, fit_frames, photo_sizes, read_photo, report_missing
-from .points import PLY_KEY, has_points, points_folder, positions_of, read_point_cloud, read_points
+from .points import PLY_KEY, has_points, points_folder, read_aligned_points, read_point_cloud, read_points
 from .splits import Splits, resolve_splits
 from .transforms import has_split_files, read_frames, read_lens, read_object, read_split_files
 
@@ -348,18 +347,7 @@ def load_points(
         if path is None:
             return None
         raise MissingFile(f"load_points: {place} has no COLMAP model with points (cameras, images and points3D)")
-    frames = read_model(model)["frames"]
-    position = positions_of({number: frame["file_path"] for number, frame in enumerate(frames)}, names)
-    if not position:
-        raise InvalidFile(f"load_points: no photo of {model} is among the {len(names)} cameras, such as {names[0]}")
-    order = list(position.values())
-    source = np.array([frames[number]["transform_matrix"] for number in position])[:, :3]
-    motion = align_poses(source, known.camera_to_world[order], label=f"load_points: {model}")
-    scale = np.ones(len(known))
-    scale[order] = [frames[number]["w"] / known.size(place)[0] for number, place in position.items()]
-    points = read_points(model, names, known, transform=motion, pixel_scale=scale)
-    warn_if_not_in_view(points, known, caller="load_points")
-    return points
+    return read_aligned_points(model, names, known, caller="load_points")
 
 
 def _named_cameras(

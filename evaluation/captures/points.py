@@ -19,8 +19,9 @@ from numpy.typing import ArrayLike, NDArray
 from ...core.cameras import Cameras
 from ...core.errors import InvalidFile, MissingFile
 from ...core.ply import read_ply_vertices
-from ...core.sparse_points import SparsePoints
-from .colmap import OWN, image_names
+from ...core.sparse_points import SparsePoints, warn_if_not_in_view
+from .alignment import align_poses
+from .colmap import OWN, image_names, read_model
 from .dataparser import applied_scale
 from .photos import find_photos
 from .transforms import clean_name
@@ -157,8 +158,8 @@ def read_points(
         names: of the photos of ``cameras``, in their order; a photo is found by its name in the model, or by a name
             that ends with it (``images/a.jpg`` for ``a.jpg``). Observations by other photos of the model are left out.
         cameras: in the frame of the result.
-        transform: ``(4, 4)`` from the model's world to that of ``cameras``, a similarity without rotation
-            (``Capture.transform``); None if they are one.
+        transform: ``(4, 4)`` similarity from the model's world to that of ``cameras`` (``Capture.transform``); None if
+            they are one.
         pixel_scale: pixels of the matched photos for one pixel of ``cameras``, one number or ``(cameras,)``.
 
     Returns:
@@ -191,6 +192,38 @@ def read_points(
         error=tracks.error,
         pixel_scale=pixel_scale,
     )
+
+
+def read_aligned_points(model: str | Path, names: Sequence[str], cameras: Cameras, *, caller: str) -> SparsePoints:
+    """Read the sparse points of a COLMAP model into the world of any cameras of the same photos.
+
+    The model's world may be another one (scaled, turned and shifted alike): photos are found by name, and the
+    similarity follows from their poses in both.
+
+    Args:
+        model: folder with ``cameras``, ``images`` and ``points3D``, ``.bin`` or ``.txt``.
+        names: of the photos of ``cameras``, in their order, as :func:`read_points` takes them.
+        cameras: in the frame of the result; each may be of a larger or smaller copy of its photo.
+        caller: begins messages.
+
+    Returns:
+        All points of the model, with the observations by ``cameras``.
+
+    Raises:
+        InvalidFile: a broken model, or one whose photos are not among the cameras, or posed otherwise.
+    """
+    frames = read_model(model)["frames"]
+    position = positions_of({number: frame["file_path"] for number, frame in enumerate(frames)}, names)
+    if not position:
+        raise InvalidFile(f"{caller}: no photo of {model} is among the {len(names)} cameras, such as {names[0]}")
+    order = list(position.values())
+    source = np.array([frames[number]["transform_matrix"] for number in position])[:, :3]
+    motion = align_poses(source, cameras.camera_to_world[order], label=f"{caller}: {model}")
+    scale = np.ones(len(cameras))
+    scale[order] = [frames[number]["w"] / cameras.size(place)[0] for number, place in position.items()]
+    points = read_points(model, names, cameras, transform=motion, pixel_scale=scale)
+    warn_if_not_in_view(points, cameras, caller=caller)
+    return points
 
 
 def has_points(model: Path) -> bool:

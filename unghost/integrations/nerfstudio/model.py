@@ -1,4 +1,4 @@
-"""nerfacto with the regularizer on: all that differs from nerfstudio's own model is two more losses.
+"""nerfacto with the regularizer on: all that differs from nerfstudio's own model is three more losses.
 
 Imports nerfstudio 1.1.5 and torch; the regularizer and the denoiser wait for the first training step.
 ``unghost/integrations/nerfstudio/method.py`` makes a method of it: ``ns-train unghost-nerfacto``.
@@ -6,7 +6,9 @@ Imports nerfstudio 1.1.5 and torch; the regularizer and the denoiser wait for th
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +16,8 @@ from nerfstudio.models.nerfacto import NerfactoModel, NerfactoModelConfig
 
 from ...core.cameras import Cameras
 from ...core.errors import InvalidArgument
-from .pitch import hash_pitch
+from ...core.sparse_points import SparsePoints
+from .pitch import hash_pitch, surface_cells
 
 
 @dataclass
@@ -32,8 +35,17 @@ class UnghostNerfactoModelConfig(NerfactoModelConfig):  # type: ignore[misc]
     """Of the score distillation; 0 switches it off."""
     unghost_visibility_weight: float = 1.0
     """Of the density where no photo looks; 0 switches it off."""
+    unghost_sight_line_weight: float = 0.03
+    """Of the opacity on sight lines from training cameras to sparse points; 0: no sparse points are used at all."""
+    unghost_end_point_weight: float = 0.01
+    """Of the transparency about those points; 0 switches it off."""
+    unghost_sight_line_reach: float = 1.0
+    """How many times the scene box sight lines may go out to, 1 to 2^20."""
+    unghost_points: Path | None = None
+    """COLMAP model with points, or a folder that holds one; None for one beside the photos, if there is one."""
     unghost_field_pitch: float | None = None
-    """Side of a cell that opacities are measured over, scene units; None for that of the finest hash level."""
+    """Side of a cell that opacities are measured over, scene units; None: of the finest level at which the hash table
+    holds a scene's surfaces."""
     unghost_denoiser: str = "default"
     """A shipped prior, or a model.safetensors."""
 
@@ -83,10 +95,11 @@ class UnghostNerfactoModel(NerfactoModel):  # type: ignore[misc]
     trained_steps: int = 0
 
     def get_training_callbacks(self, training_callback_attributes: Any) -> list[Any]:
-        """nerfacto's; the cameras that it will be regularized with are noted here."""
+        """nerfacto's; the cameras and points that it will be regularized with are noted here."""
         pipeline = training_callback_attributes.pipeline
         if pipeline is not None:
-            self.regularize(pipeline.datamanager.train_dataset.cameras)
+            dataset = pipeline.datamanager.train_dataset
+            self.regularize(dataset.cameras, dataset.image_filenames)
         from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 
         def note(step: int) -> None:
@@ -96,8 +109,11 @@ class UnghostNerfactoModel(NerfactoModel):  # type: ignore[misc]
         before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
         return [*callbacks, TrainingCallback(where_to_run=before, update_every_num_iters=1, func=note)]
 
-    def regularize(self, cameras: Any) -> None:
-        """Regularize from now on, knowing these cameras (nerfstudio's, of the training photos)."""
+    def regularize(self, cameras: Any, photos: Sequence[str | Path] = ()) -> None:
+        """Regularize from now on, knowing these cameras (nerfstudio's, of the training photos) and their files.
+
+        Without files there are no sparse points, so no sight lines.
+        """
         from ...denoisers import load_denoiser
         from ...regularizer.density_regularizer import DensityRegularizer
 
@@ -107,23 +123,42 @@ class UnghostNerfactoModel(NerfactoModel):  # type: ignore[misc]
         if denoiser.kind == "torch":
             denoiser = denoiser.to(self.device)
         aabb, pitch = self.scene_box.aabb.double().cpu().numpy(), c.unghost_field_pitch
-        own = hash_pitch(c.max_res, aabb, contracted=not c.disable_scene_contraction)
+        cells = min(c.max_res, surface_cells(c.log2_hashmap_size))
+        own = hash_pitch(cells, aabb, contracted=not c.disable_scene_contraction)
+        known = cameras_of(cameras)
         self.regularizer = DensityRegularizer(
             denoiser,
             aabb=aabb,
-            cameras=cameras_of(cameras),
+            cameras=known,
+            points=self.sparse_points(known, photos),
             field_pitch=own if pitch is None else pitch,
             cubes=c.unghost_cubes,
             dsds_weight=c.unghost_dsds_weight,
             visibility_weight=c.unghost_visibility_weight,
+            sight_line_weight=c.unghost_sight_line_weight,
+            end_point_weight=c.unghost_end_point_weight,
+            sight_line_reach=c.unghost_sight_line_reach,
         )
+
+    def sparse_points(self, cameras: Cameras, photos: Sequence[str | Path]) -> SparsePoints | None:
+        """Points that these cameras observed, in nerfstudio's trained world; one line of the log says which."""
+        c = self.config
+        if c.unghost_sight_line_weight == 0 or not photos:
+            return None
+        from nerfstudio.utils.rich_utils import CONSOLE
+
+        from .points import load_training_points
+
+        found = load_training_points(photos, cameras, model=c.unghost_points)
+        CONSOLE.log(f"unghost: {'no sight lines' if found.points is None else 'sight lines'}: {found.about}")
+        return found.points
 
     def density_fields(self) -> list[Any]:
         """The field's density and each proposal network's, once."""
         return [self.field.density_fn, *dict.fromkeys(self.density_fns)]
 
     def get_loss_dict(self, outputs: Any, batch: Any, metrics_dict: Any = None) -> dict[str, Any]:
-        """nerfacto's losses, and ``unghost_dsds`` and ``unghost_visibility`` at the steps whose turn it is."""
+        """nerfacto's losses, and at the steps whose turn it is ``unghost_dsds``, ``_visibility``, ``_sight_lines``."""
         losses: dict[str, Any] = super().get_loss_dict(outputs, batch, metrics_dict)
         step, c = self.trained_steps, self.config
         if self.training and self.regularizer is not None and step >= c.unghost_start and step % c.unghost_every == 0:

@@ -1,50 +1,25 @@
 """nerfstudio's cameras as ours, without nerfstudio: stand-ins with the attributes that are read."""
 
-import enum
-import importlib
-import sys
-import types
-
 import numpy as np
 import pytest
 
-torch = pytest.importorskip("torch")
+pytest.importorskip("torch")
 
-
-class CameraType(enum.Enum):
-    """The first three of nerfstudio's."""
-
-    PERSPECTIVE = 1
-    FISHEYE = 2
-    EQUIRECTANGULAR = 3
+import torch
+from unghost_tests import nerfstudio_stubs
+from unghost_tests.nerfstudio_stubs import CameraType
 
 
 @pytest.fixture
 def cameras_of(monkeypatch):
-    names = ["nerfstudio", "nerfstudio.models", "nerfstudio.models.nerfacto", "nerfstudio.cameras"]
-    modules = {name: types.ModuleType(name) for name in [*names, "nerfstudio.cameras.cameras"]}
-    modules["nerfstudio.models.nerfacto"].NerfactoModel = type("NerfactoModel", (), {})
-    modules["nerfstudio.models.nerfacto"].NerfactoModelConfig = type("NerfactoModelConfig", (), {})
-    modules["nerfstudio.cameras.cameras"].CameraType = CameraType
-    for name, module in modules.items():
-        monkeypatch.setitem(sys.modules, name, module)
-    name = "unghost.integrations.nerfstudio.model"
-    monkeypatch.delitem(sys.modules, name, raising=False)
-    yield importlib.import_module(name).cameras_of
-    sys.modules.pop(name, None)
+    yield nerfstudio_stubs.import_model(monkeypatch)[0].cameras_of
+    nerfstudio_stubs.forget_model()
 
 
 def theirs(kinds, bend):
-    count = len(kinds)
-    column = {name: torch.tensor([[value]] * count) for name, value in dict(fx=20.0, fy=21.0, cx=16.0, cy=12.0).items()}
-    return types.SimpleNamespace(
-        camera_type=torch.tensor([[kind.value] for kind in kinds]),
-        width=torch.tensor([[32], [64]][:count]),
-        height=torch.tensor([[24], [48]][:count]),
-        camera_to_worlds=torch.eye(4)[None, :3].repeat(count, 1, 1),
-        distortion_params=torch.tensor(bend),
-        **column,
-    )
+    sizes = {"width": torch.tensor([32, 64][: len(kinds)]), "height": torch.tensor([24, 48][: len(kinds)])}
+    poses = torch.eye(4)[None, :3].repeat(len(kinds), 1, 1)
+    return nerfstudio_stubs.theirs(poses, intrinsics=(20, 21, 16, 12), kinds=kinds, bend=bend, **sizes)
 
 
 def test_fisheyes_stay_fisheyes_and_sizes_become_the_first(cameras_of):

@@ -1,9 +1,9 @@
-"""The side of nerfacto's finest hash cells."""
+"""The side of nerfacto's hash cells."""
 
 import numpy as np
 import pytest
 
-from unghost.integrations.nerfstudio import hash_pitch
+from unghost.integrations.nerfstudio import hash_pitch, surface_cells
 
 BOX = np.array([[-1.0] * 3, [1.0] * 3])
 
@@ -32,3 +32,12 @@ def test_beyond_it_is_the_side_of_a_cube_of_a_cells_volume():
 def test_no_cells_are_refused():
     with pytest.raises(ValueError, match="hash_pitch: max_res must be >= 1, got 0"):
         hash_pitch(0, BOX, contracted=True)
+
+
+def test_surfaces_fit_the_table_at_the_level_that_is_measured():
+    for size in (3, 15, 17, 19, 22):
+        cells = surface_cells(size)
+        assert 8 * cells**2 <= 2**size < 8 * (cells + 1) ** 2
+    assert hash_pitch(min(2048, surface_cells(19)), BOX, contracted=True) == 2 / 128  # as for a field of no known cells
+    with pytest.raises(ValueError, match="surface_cells: log2_hashmap_size must be >= 3, got 2"):
+        surface_cells(2)
