@@ -22,6 +22,7 @@ from unghost.baselines.bayes_rays import LOWEST, deformation_uncertainty
 from unghost.cleaning.components import label_components
 from unghost.cleaning.keep_mask import KeepMask
 from unghost.cleaning.pipeline import Judgement, judge
+from unghost.facade.choice import choose_denoiser
 from unghost.fields.filtered import FilteredField
 from unghost.regularizer.removal import RemovalLoss
 from unghost.regularizer.settings import RegularizerSettings
@@ -125,11 +126,14 @@ def restoration(job: Job, **over: Any) -> list[Outcome]:
     return [_doubted(fine_tuned(job, lambda job: make_regularizer(job, **over)))]
 
 
-def judged(job: Job, base: Any, model: str = "default") -> Judgement:
+def judged(job: Job, base: Any, *, with_points: bool = False) -> Judgement:
+    """The field judged by the density alone, or by what a user with cameras and sparse points gives."""
+    known: dict[str, Any] = {}
+    if with_points:
+        known = {"cameras": job.scene.train.cameras, "points": job.scene.points}
+    model = choose_denoiser(known.get("cameras"), known.get("points"))
     denoiser = load_denoiser(model, backend="onnx", threads=job.threads)
-    looks = {"view_count", "transmittance"} & set(denoiser.manifest.channels)
-    cameras = job.scene.train.cameras if looks else None
-    return judge(base.density_fn, base.aabb, denoiser=denoiser, cameras=cameras, field_pitch=base.field_pitch)
+    return judge(base.density_fn, base.aabb, denoiser=denoiser, field_pitch=base.field_pitch, **known)
 
 
 def _doubted(outcome: Outcome) -> Outcome:
@@ -199,10 +203,12 @@ def _components(job: Job) -> list[Outcome]:
     return [Outcome(FilteredField(job.base, mask.keep), **clock.read())]
 
 
-def cleaned(job: Job, base: Any, *, strengths: tuple[float, ...] = STRENGTHS) -> list[Outcome]:
+def cleaned(
+    job: Job, base: Any, *, strengths: tuple[float, ...] = STRENGTHS, with_points: bool = False
+) -> list[Outcome]:
     """``clean`` of a field at each strength."""
     clock = Clock()
-    judgement = judged(job, base)
+    judgement = judged(job, base, with_points=with_points)
     masks = {strength: judgement.mask(strength) for strength in strengths}
     took = clock.read()
     return [
@@ -260,7 +266,7 @@ METHODS: dict[str, Callable[[Job], list[Outcome]]] = {
     "dsds+sight-lines": _sight_lines(dsds=True),
     "dsds+sight-lines+distortion": _sight_lines(dsds=True, distortion=True),
     "dsds+sight-lines+tv": _sight_lines(total_variation, dsds=True),
-    # "clean+points" goes here, and its points into `judged`, as soon as `clean` takes points
+    "clean+points": lambda job: cleaned(job, job.base, with_points=True),
     "scratch": lambda job: [Outcome(job.base, job.fit_seconds, steps=job.fit_steps)],
     "scratch+distortion": _scratch(distortion=True),
     "scratch+sight-lines": _scratch(lines=True),
@@ -295,4 +301,4 @@ WITH_POINTS = (
 )
 FROM_SCRATCH = ("scratch", "scratch+distortion", "scratch+sight-lines", "scratch+all")
 # equal seconds say nothing of them
-UNTRAINED = ("fitted", "photo-doubt", "bayes-rays", "components", "clean", *FROM_SCRATCH)
+UNTRAINED = ("fitted", "photo-doubt", "bayes-rays", "components", "clean", "clean+points", *FROM_SCRATCH)

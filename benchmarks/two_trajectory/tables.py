@@ -72,6 +72,7 @@ COLORS = {  # in the order of the tables
     "dsds-once": "#b15928",
     "dsds-once+tv": "#6a3d9a",
     "clean": "#ff7f0e",
+    "clean+points": "#c7681c",
     "visibility+clean": "#ffbb78",
     "dsds-restoration+clean": "#ff9896",
     "visibility+ds-nerf": "#b2df8a",

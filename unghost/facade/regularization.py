@@ -15,13 +15,15 @@ from ..denoisers import load_denoiser
 from ..regularizer.density_regularizer import DensityRegularizer as RequiredDenoiserRegularizer
 from ..regularizer.pitch import FieldPitch
 from ..regularizer.settings import RegularizerSettings
+from .choice import choose_denoiser
 
 
 class DensityRegularizer(RequiredDenoiserRegularizer):
     """Add a learned prior over local geometry, a visibility prior and sight lines to the loss of any radiance field.
 
     Args:
-        denoiser: from :func:`unghost.load_denoiser`; None loads the shipped default through onnxruntime.
+        denoiser: from :func:`unghost.load_denoiser`; None loads, through onnxruntime, the shipped one that fits what is
+            known (:func:`unghost.facade.choice.choose_denoiser`).
         aabb: ``(2, 3)`` smallest and largest corner, scene units: where the losses act.
         cameras: of the training photos; None switches the visibility loss off.
         depth_maps: ``(cameras, height, width)`` of the photos, along the optical axis, inf for nothing: the visibility
@@ -80,7 +82,7 @@ class DensityRegularizer(RequiredDenoiserRegularizer):
         }
         changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
         super().__init__(
-            load_denoiser() if denoiser is None else denoiser,
+            load_denoiser(choose_denoiser(cameras, points)) if denoiser is None else denoiser,
             aabb=aabb,
             cameras=cameras,
             depth_maps=depth_maps,
