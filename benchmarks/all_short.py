@@ -24,6 +24,7 @@ WITHOUT_DATA = (
     "cleaning.splats",
     "data.curate",
     "data.harvest_statistics",
+    "data.point_statistics",
     "denoise.channels_study",
     "denoise.run",
     "regularizer.cost",

@@ -138,6 +138,23 @@ def corner_strength(
     around = places + shift * length[:, None]
     _, flat = photographed.look
     grey = scene.albedo(around.reshape(-1, 3)).mean(axis=1).reshape(9, -1) * (scene.ambient + 0.3) * (1 - flat)
+    return least_contrast(grey)
+
+
+def least_contrast(grey: Array) -> Array:
+    """Square root of the smaller eigenvalue of the structure tensor of 3 x 3 samples.
+
+    Args:
+        grey: ``(9, N)`` grey levels, samples of a row of pixels of equal x first.
+
+    Returns:
+        ``(N,)`` root mean square difference of neighbouring samples in the direction in which it is least.
+
+    Example:
+        >>> edge, corner = [0, 0, 0, 0, 0, 0, 1, 1, 1], [0, 0, 0, 0, 1, 1, 0, 1, 1]
+        >>> least_contrast(np.array([edge, corner], dtype=float).T).round(2).tolist()
+        [0.0, 0.35]
+    """
     grid = grey.reshape(3, 3, -1)
     across = (grid[1:, :-1] + grid[1:, 1:] - grid[:-1, :-1] - grid[:-1, 1:]) / 2
     along = (grid[:-1, 1:] + grid[1:, 1:] - grid[:-1, :-1] - grid[1:, :-1]) / 2

@@ -4,7 +4,7 @@
 
 Writes docs/harvest.md and docs/harvest/pairs.png, and docs/harvest/sample: a shard of a few cubes of scenes
 without meshes (so that all of it is generated), for a look and for tests. Run benchmarks/data/harvest_statistics.py
-first.
+and benchmarks/data/point_statistics.py first.
 """
 
 from __future__ import annotations
@@ -37,6 +37,25 @@ SAMPLE_CUBES = 8  # 82 kB each
 SHOWN, WIDTH, GAP = 6, 192, 8
 HEADINGS = ("what the field shows", "the truth", "a slice: opacity", "labels", "surroundings", "views (white: 24+)")
 MOST_VIEWS = 24
+POINT_MEASURES = {  # of docs/results/points.json, and what the page calls them
+    "points": "points",
+    "views": "photos that observed a point, mean",
+    "views_2": "share of points of two photos",
+    "views_5": "share of points of five photos or more",
+    "error_p50": "reprojection error, median, pixels",
+    "error_p90": "reprojection error, highest tenth, pixels",
+    "angle_p10": "triangulation angle, lowest tenth, degrees",
+    "angle_p50": "triangulation angle, median, degrees",
+    "angle_p90": "triangulation angle, highest tenth, degrees",
+    "off_pixels_p50": "distance to the surface, median, pixels",
+    "off_pixels_p90": "distance to the surface, highest tenth, pixels",
+    "off_sigmas_p50": "distance to the surface, median, own uncertainties",
+    "off_sigmas_p90": "distance to the surface, highest tenth, own uncertainties",
+    "wrong": "share of wrong points",
+    "outvoted": "share of observations that the vote drops",
+    "texture_ratio": "contrast at points over contrast anywhere, medians",
+    "texture_rank": "probability of more contrast than a random pixel",
+}
 
 
 @dataclass(frozen=True)
@@ -173,6 +192,50 @@ def statistics_table(docs: Path) -> list[str]:
     ]
 
 
+def points_table(docs: Path) -> list[str]:
+    """The comparison of docs/results/points.json, and the command that repeats it."""
+    results = json.loads((docs / "results" / "points.json").read_text(encoding="utf-8"))
+    lines = [
+        "| measure | triangulated: median (lowest to highest set) | simulated: median (one set in ten below, above) "
+        "| differs |",
+        "|---|---|---|---|",
+    ]
+    for name, label in POINT_MEASURES.items():
+        if name not in results["compared"]:
+            continue
+        both = results["compared"][name]
+        digits = 0 if name == "points" else 3 if name in ("wrong", "outvoted") else 2
+        cells = [
+            f"{mid:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
+            for low, mid, high in (both["real"], both["simulated"])
+        ]
+        lines.append(f"| {label} | {' | '.join(cells)} | {'yes' if both['outside'] else 'no'} |")
+    return [*lines, "", f"`{results['command']}`"]
+
+
+def points_section(docs: Path) -> list[str]:
+    """The page's part on sparse points; empty as long as they were not measured."""
+    if not (docs / "results" / "points.json").exists():
+        return []
+    return [
+        "## Do simulated sparse points look like triangulated ones?",
+        "",
+        "The evidence of harvested cubes comes from simulated points "
+        "(`unghost.scenes.sparse_points.simulate_sparse_points`), because matching photos of every scene would take "
+        "a minute each. Here they stand beside points that were triangulated from the photos of one sweep: of two "
+        "real captures (photos of 1,000 pixels), and of three synthetic scenes (seed 555, rendered at 384 pixels). "
+        "The surface of a capture is unknown, so distances to it are of the synthetic scenes alone. A point is wrong "
+        "if it is farther from the surface than three of its uncertainties and five pixels together; the vote is that "
+        "of `SightLines.build`. A measure *differs* if the medians are farther apart than the triangulated sets are "
+        "among themselves.",
+        "",
+        *points_table(docs),
+        "",
+        "![distributions of the measures](results/points.png)",
+        "",
+    ]
+
+
 def page(options: Options, found: dict[str, Any], sample_bytes: int) -> str:
     """The text of docs/harvest.md."""
     config = HarvestConfig()
@@ -224,6 +287,7 @@ def page(options: Options, found: dict[str, Any], sample_bytes: int) -> str:
             "",
             "![distances, and distributions of the features](results/statistics.png)",
             "",
+            *points_section(options.docs),
         ]
     )
 
