@@ -40,7 +40,7 @@ def shipped_names() -> list[str]:
 
     Example:
         >>> shipped_names()
-        ['default', 'views', 'xs']
+        ['default', 'evidence', 'views', 'xs']
     """
     return sorted({path.stem for suffix in SUFFIXES.values() for path in WEIGHTS.glob(f"*{suffix}")})
 
@@ -51,8 +51,9 @@ def load_denoiser(
     """Load the shipped denoiser, or one of your own.
 
     Args:
-        name_or_path: a shipped name (``"default"``; ``"views"``, which takes view counts too; ``"xs"``, a
-            smaller one), or the path of an ``.onnx`` or ``.safetensors`` file.
+        name_or_path: a shipped name (``"default"``; ``"evidence"``, which takes cameras and their sparse points;
+            ``"views"``, which takes view counts; ``"xs"``, a smaller one), or the path of an ``.onnx`` or
+            ``.safetensors`` file.
         backend: ``"onnx"`` (numpy arrays in and out; no torch) or ``"torch"`` (tensors). None takes what
             the file's ending says, and ``"onnx"`` for a shipped name.
         threads: of onnxruntime; None leaves the choice to it.

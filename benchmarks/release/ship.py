@@ -113,7 +113,10 @@ def row_of(denoiser: Any, threshold: float, rooms: tuple[int, ...]) -> dict[str,
         mask = clean(grid_density_fn(room.density, AABB), AABB, denoiser=advised, field_pitch=room.pitch, **known)
         found.append(score(room, np.asarray(mask.keep(cell_centers(AABB, SHAPE)))))
     keys = ("floater_recall", "floater_precision", "surface_kept", "iou_before", "iou")
-    means = {key: float(np.mean([scores[key] for scores in found])) for key in keys}
+    means: dict[str, float | None] = {}
+    for key in keys:
+        values = [scores[key] for scores in found if scores[key] is not None]  # no precision where nothing is removed
+        means[key] = float(np.mean(values)) if values else None
     return {"method": "clean", "threshold": threshold, **means}
 
 

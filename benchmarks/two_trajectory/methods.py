@@ -22,7 +22,6 @@ from unghost.baselines.bayes_rays import LOWEST, deformation_uncertainty
 from unghost.cleaning.components import label_components
 from unghost.cleaning.keep_mask import KeepMask
 from unghost.cleaning.pipeline import Judgement, judge
-from unghost.facade.choice import choose_denoiser
 from unghost.fields.filtered import FilteredField
 from unghost.regularizer.removal import RemovalLoss
 from unghost.regularizer.settings import RegularizerSettings
@@ -127,12 +126,11 @@ def restoration(job: Job, **over: Any) -> list[Outcome]:
 
 
 def judged(job: Job, base: Any, *, with_points: bool = False) -> Judgement:
-    """The field judged by the density alone, or by what a user with cameras and sparse points gives."""
+    """The field judged by the default prior, or by the one that takes cameras and sparse points."""
     known: dict[str, Any] = {}
     if with_points:
         known = {"cameras": job.scene.train.cameras, "points": job.scene.points}
-    model = choose_denoiser(known.get("cameras"), known.get("points"))
-    denoiser = load_denoiser(model, backend="onnx", threads=job.threads)
+    denoiser = load_denoiser("evidence" if with_points else "default", backend="onnx", threads=job.threads)
     return judge(base.density_fn, base.aabb, denoiser=denoiser, field_pitch=base.field_pitch, **known)
 
 

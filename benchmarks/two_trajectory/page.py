@@ -57,7 +57,7 @@ ROWS = {
     "dsds-once": "ours: the prior judges the field once, as for `clean`, and what it would take out is held down while "
     "the field trains on (`RemovalLoss`): the photos may object",
     "clean": "ours: `unghost.clean` on `fitted`, or after another method (`…+clean`)",
-    "clean+points": "ours: `unghost.clean` given the training cameras and their sparse points, which chooses the prior",
+    "clean+points": "ours: `unghost.clean` with the prior `evidence`, the training cameras and their sparse points",
     "visibility+ds-nerf": "DS-NeRF's depth supervision by the sparse points of the training photos, deviations from "
     "their triangulation",
     "visibility+urban": "the expected-depth and line-of-sight losses of Urban Radiance Fields, on the same points",

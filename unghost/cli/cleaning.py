@@ -68,9 +68,8 @@ def clean(
             (Inria's) or a COLMAP model. The photos are not needed. A dataparser_transforms.json (nerfstudio's) beside
             either file is applied.
         points: a COLMAP model with sparse points, or a folder that holds one; the one beside --cameras if not given.
-            Its points and who observed them tell surfaces from ghosts.
-        denoiser: a shipped name or an .onnx file; if not given, evidence for a grid with cameras and sparse points,
-            else default.
+            For --denoiser evidence: the points and who observed them tell surfaces from ghosts.
+        denoiser: a shipped name or an .onnx file; default if not given. evidence takes --cameras and sparse points.
         strength: 0 removes nothing, 0.5 what the denoiser advises, 1 everything.
         resolution: of splats, cells along the longest side of the box; by the splats' sizes if not given.
         reach: of splats, how many times the scene's core (98 % of the opacity) is cleaned (twice if not given); what
@@ -142,7 +141,7 @@ def _judging(
     from ..facade.choice import choose_denoiser
 
     known = None if cameras is None else load_cameras(cameras, scene=source)
-    wanted = cameras is not None and (points is not None or denoiser in (None, "evidence"))
+    wanted = cameras is not None and (points is not None or denoiser == "evidence")
     sparse = load_points(points, cameras, scene=source) if cameras is not None and wanted else None
     name = denoiser or choose_denoiser(known, sparse)
     about = [f"{len(known)} cameras"] if known is not None else []
