@@ -81,7 +81,7 @@ def optical_depth(signed: NDArray[np.float32]) -> NDArray[np.float64]:
         [0.0, 0.693, 4.605]
     """
     through = np.maximum((1.0 - signed.astype(np.float64)) / 2.0, np.exp(-MOST_DEPTH))
-    depth: NDArray[np.float64] = -np.log(through)
+    depth: NDArray[np.float64] = np.log(1.0 / through)
     return depth
 
 

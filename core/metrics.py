@@ -122,6 +122,7 @@ COST = (
     Metric("milliseconds_regularized", "ms a regularized step", "lower", 1, "ms"),
     Metric("milliseconds_of_them", "ms of those, regularizer", "lower", 1, "ms"),
     Metric("megabytes", "MB", "lower", 2, "MB"),
+    Metric("ratio", "ratio to the first of its kind", "lower", 2, ""),
     Metric("peak_megabytes", "peak MB", "lower", 0, "MB"),
     Metric("parameters", "parameters", "none", 0),
     Metric("gflop", "GFLOP a cube", "lower", 2, "GFLOP"),

@@ -153,7 +153,7 @@ def least_contrast(grey: Array) -> Array:
     Example:
         >>> edge, corner = [0, 0, 0, 0, 0, 0, 1, 1, 1], [0, 0, 0, 0, 1, 1, 0, 1, 1]
         >>> least_contrast(np.array([edge, corner], dtype=float).T).round(2).tolist()
-        [0.0, 0.35]
+        [0.0, 0.5]
     """
     grid = grey.reshape(3, 3, -1)
     across = (grid[1:, :-1] + grid[1:, 1:] - grid[:-1, :-1] - grid[:-1, 1:]) / 2

@@ -181,7 +181,7 @@ def build_rows(points: SparsePoints, cameras: Cameras, options: Options) -> list
     for row, name in zip(rows, names):
         levels = [built[name], *built[name].shells]
         held = sum(each.crossed.nbytes + each.supported.nbytes for each in levels)
-        row |= {"lines": len(built[name]), "megabytes_of_cells": held / 1e6}
+        row |= {"lines": len(built[name]), "megabytes": held / 1e6}
     where = points.xyz[np.random.default_rng(1).integers(len(points), size=options.observations)]
     places = where + np.random.default_rng(2).normal(0, pitch, where.shape)
     asked = {name: functools.partial(built[name].crossings, places) for name in ("box", "wide", "twice", "shells")}

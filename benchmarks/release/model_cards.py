@@ -41,8 +41,8 @@ EVIDENCE = (
 )
 EVIDENCE_LIMITS = (
     " Sparse points were simulated in training; the last layer and the threshold were fitted to scenes 128 to "
-    "135 of the harvest's seed with other points (`benchmarks.denoise.point_sets`). On the labelled rooms, whose ghosts are solid blobs, it removes fewer "
-    "of them than `default` (docs/results/threshold_evidence.json), so that it is never chosen by itself. Where few "
+    "135 of the harvest's seed with other points (`benchmarks.denoise.point_sets`). On the labelled rooms, whose ghosts "
+    "are solid blobs, it removes fewer of them than `default` (docs/results/threshold_evidence.json), so that it is never chosen by itself. Where few "
     "sight lines cross the ghosts, as in the set `capture`, it is no better than the others."
 )
 LICENCES = (
