@@ -43,7 +43,7 @@ EVIDENCE_LIMITS = (
     " Sparse points were simulated in training; the last layer and the threshold were fitted to scenes 128 to 135 of "
     "the harvest's seed with other points (`benchmarks.denoise.point_sets`). On the labelled rooms, whose ghosts are "
     "solid blobs, it removes fewer of them than `default` (docs/results/threshold_evidence.json), so that it is never "
-    "chosen by itself. Where few sight lines cross the ghosts, as in the set `capture`, it is no better than the others."
+    "chosen by itself. Where few sight lines cross the ghosts, as in the set `capture`, it is no better than others."
 )
 LICENCES = (
     "Procedural solids, synthetic rooms and harvested fields are made by this project; the meshes are CC0-1.0 and "
