@@ -28,10 +28,8 @@ if TYPE_CHECKING:
 
 POINT_STREAM = 0x73666D  # keeps the points apart from all else that is drawn for a scene
 TOGETHER = 8  # consecutive cubes that share a set of points
-FINEST, LEVELS = (
-    0.008,
-    3,
-)  # pitch of the finest grid of a room's sight lines, and how many there are, twice as coarse each
+FINEST = 0.008  # pitch of the finest grid of a room's sight lines
+LEVELS = 3  # grids for a room, each twice as coarse as the one before
 
 
 def point_sets(
@@ -119,7 +117,7 @@ def replace_evidence(
     """
     if sets < 1:
         raise InvalidArgument(f"replace_evidence: sets must be >= 1, got {sets}")
-    folders = [path for path in find_shards(source)]
+    folders = find_shards(source)
     for path in folders:
         target = Path(out) / path.name
         if target.exists():

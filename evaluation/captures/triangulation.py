@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 PLAIN = (".jpg", ".jpeg", ".png")  # COLMAP reads these from disk; others are decoded first
 LONGEST_SIDE = 1600
-PEAK_THRESHOLD = 0.002  # of SIFT's contrast; COLMAP's .0067 gives half the points at the same reprojection error
+PEAK_THRESHOLD = 0.002  # of SIFT's contrast; COLMAP's own is .0067
 MOST_FEATURES = 16_384  # a photo
 TO_COLMAP = np.diag([1.0, -1.0, -1.0])  # OpenGL's camera axes to COLMAP's
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from ..core.cameras import Cameras
 from ..core.sparse_points import SparsePoints
 
-# A model is chosen by itself only if it is no worse than `default` on every validation set. `evidence` removes three
-# to four times as many ghosts of fitted fields, but fewer solid floaters of the labelled rooms (docs/prior.md).
+# A model is chosen by itself only if it is no worse than `default` on every validation set. At the threshold that it
+# ships with, `evidence` removes fewer of the solid floaters of the labelled rooms (docs/prior.md).
 EVIDENCE_QUALIFIES = False
 
 
